@@ -409,7 +409,10 @@ class _Check:
         still = {name for name, change in self.idle.items() if not change}
         counts = {n for n, value in before.items() if _tells(value)} - still
         if all(before[n] == self.leaves.get(n) for n in before.keys() - counts):
-            text = "no number of state changes: give a command that moves it"
+            text = (
+                "no number of state changes on the way: give a command that moves it, or let "
+                "`state` tell where it is"
+            )
             self.fault(f"{dict(there)}: {text}")
         else:
             self.stands(f"after {dict(there)}")

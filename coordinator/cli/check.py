@@ -84,20 +84,22 @@ def run(options: argparse.Namespace) -> int:
         cell.faults.append(str(fault))
     faults = [*read.faults, *cell.faults]
     if read.value is None:
-        raise CommandError(2, "\n".join(faults))
+        raise _refused(options.json, task_path(options.task).stem, read, cell.faults)
     task, analysed = read.value, not read.unknown
     judged, report = _checked(task, cell, code, analysed)
     if not services and not faults:
         report = _noted(report)
     if not analysed:
-        raise CommandError(2, "\n".join([*faults, *_independent(options.task, report, read, cell)]))
+        others = [*cell.faults, *_independent(options.task, report, read, cell)]
+        raise _refused(options.json, task.name, read, others)
     report = CheckReport(tuple(f for f in report.findings if cell.is_new(f.key, f.text)))
     missing = _missing(task, services) if options.live and not faults else []
     analysis, ok = judged.analysis, judged.ok and report.ok and not faults
     live = {"live": missing} if options.live else {}
-    if options.json and not faults:
+    if options.json:
         data = {} if analysis is None else _plain_analysis(analysis)
-        findings = _plain(report, options.task)
+        findings = [_plain_fault(line, read.source) for line in faults]
+        findings += _plain(report, options.task)
         write_json(
             options.json, {"task": task.name, "ok": ok, "findings": findings, **data, **live}
         )
@@ -114,6 +116,28 @@ def run(options: argparse.Namespace) -> int:
         if missing
         else 0
     )
+
+
+def _refused(json: str | None, task: str, read: FaultyFile[Task], more: list[str]) -> CommandError:
+    """Return the refusal of a task whose net was not judged, and write its JSON. `more`: what else
+    is wrong."""
+    faults = [*read.faults, *more]
+    if json:
+        findings = [_plain_fault(line, read.source) for line in faults]
+        write_json(json, {"task": task, "ok": False, "findings": findings})
+    return CommandError(2, "\n".join(faults))
+
+
+def _plain_fault(line: str, source: str) -> dict[str, Any]:
+    """Return a fault, "FILE:LINE: KEY: text; remedy", as a finding. The key of another file than
+    the task begins with that file and line."""
+    at = re.match(r"(.+?):(\d+): (?:([^\s:]+): )?", line)
+    file, number, key = at.groups("") if at else ("", "", "")
+    text, _, remedy = line[at.end() if at else 0 :].partition("; ")
+    if file != source:
+        key = f"{file}:{number}: {key}" if file else ""
+    where = int(number) if file == source else None
+    return {"severity": "error", "key": key, "text": text, "remedy": remedy, "line": where}
 
 
 def _read_task(name: str) -> FaultyFile[Task]:
@@ -522,5 +546,6 @@ def _reasons(analysis: Analysis) -> Iterator[Told]:
             unknown.setdefault(verdict.reason, []).append(name.replace("_", " "))
     for why, names in unknown.items():
         yield Told(Severity.WARNING, f"{', '.join(names)}: {why}")
+    faulty = any(one.objections for one in analysis.fewer.values())
     for text in analysis.with_fewer:
-        yield Told(Severity.WARNING, text)
+        yield Told(Severity.WARNING if faulty else Severity.NOTE, text)

@@ -106,9 +106,11 @@ class FaultyFile(Generic[T]):
             except refused as fault:
                 at = re.match(rf"{re.escape(self.source)}:(\d+): (.*)", str(fault))
                 number, said = (int(at[1]), at[2]) if at else (0, "")
-                if number > last + 1 or last < 0:
+                # What follows a line that was left out may be the rest of its value.
+                own = last < 0 or number > last + 1 or (number > last and _entry(lines[last]))
+                if own:
                     self.faults.append(str(fault))
-            if not last + 1 < number <= len(lines) or lines[number - 1].lstrip().startswith("["):
+            if not own or number > len(lines) or lines[number - 1].lstrip().startswith("["):
                 return None
             if not _closed(lines, number - 1, said):
                 self.unknown |= {*_names_in(lines[:number])}
@@ -189,6 +191,11 @@ class FaultyFile(Generic[T]):
             table[path[-1]] = [v for v in value if v not in wrong]
         else:
             del table[path[-1]]
+
+
+def _entry(line: str) -> bool:
+    """Return whether a line begins with a key, and so with a value of its own."""
+    return re.match(r"\s*[\w.-]+\s*=", line) is not None
 
 
 def _closed(lines: list[str], at: int, said: str) -> bool:

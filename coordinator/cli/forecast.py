@@ -126,7 +126,9 @@ def run(options: argparse.Namespace) -> int:
             return _compare(registered, folder, options)
         if options.task is None or options.estimates is None:
             raise CommandError(
-                2, "give TASK and --estimates CAMPAIGN to forecast, or --compare FORECAST CAMPAIGN"
+                2,
+                "give TASK and --estimates CAMPAIGN to forecast (`petrobot campaign TASK --out "
+                "CAMPAIGN` measures one), or --compare FORECAST CAMPAIGN",
             )
         why = "a forecast has no table; give it beside --compare"
         refuse_idle(options, why, idle={"markdown"})

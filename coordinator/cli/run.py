@@ -156,7 +156,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_journal_arguments(parser)
     add_page_arguments(parser)
     add_log_level_argument(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
+    parser.add_argument(
+        "--quiet",
+        action="store_true",
+        help="no progress, and no search of the net for faults",
+    )
     add_services_argument(parser)
     parser.set_defaults(folder=None)
 

@@ -152,25 +152,41 @@ def endless(task: Task) -> set[str]:
 
     Of the transitions that wait for nothing, those are dropped again and again that drain a place
     which no other of them fills, or that fill a place which inhibits them and which no other of
-    them drains: they can fire only finitely often. The others may fire for ever.
+    them drains: they can fire only finitely often. What none of them changes stays as it is, so
+    they are judged once with those that need k tokens there, and once with those that k tokens
+    inhibit. The others may fire for ever.
     """
     net = task.net
     changes = dict(zip(net.transitions, net.compiled.changes, strict=True))
-    barred = {
-        t: {p for p, _ in inhibitors}
-        for t, inhibitors in zip(net.transitions, net.inhibit, strict=True)
-    }
-    loose = {t.name for t in task.transitions.values() if is_timeless(t)}
-    while True:
-        filled = {p for t in loose for p, change in changes[t] if change > 0}
-        drained = {p for t in loose for p, change in changes[t] if change < 0}
-        finite = {
-            t
-            for t in loose
-            for p, change in changes[t]
-            if (change < 0 and p not in filled)
-            or (change > 0 and p in barred[t] and p not in drained)
-        }
-        if not finite:
-            return loose
-        loose -= finite
+    needs = dict(zip(net.transitions, map(dict, net.compiled.needs), strict=True))
+    barred = dict(zip(net.transitions, map(dict, net.inhibit), strict=True))
+
+    def repeatable(loose: set[str]) -> set[str]:
+        while True:
+            filled = {p for t in loose for p, change in changes[t] if change > 0}
+            drained = {p for t in loose for p, change in changes[t] if change < 0}
+            finite = {
+                t
+                for t in loose
+                for p, change in changes[t]
+                if (change < 0 and p not in filled)
+                or (change > 0 and p in barred[t] and p not in drained)
+            }
+            if not finite:
+                return loose
+            loose = loose - finite
+
+    def split(loose: set[str]) -> set[str]:
+        changed = {p for t in loose for p, _ in changes[t]}
+        for place, k in sorted({limit for t in loose for limit in barred[t].items()}):
+            if place not in changed:
+                few = {t for t in loose if needs[t].get(place, 0) < k}
+                many = {t for t in loose if barred[t].get(place, k + 1) > k}
+                if (rest := repeatable(few) | repeatable(many)) < loose:
+                    return rest
+        return loose
+
+    loose = repeatable({t.name for t in task.transitions.values() if is_timeless(t)})
+    while (rest := split(loose)) < loose:
+        loose = repeatable(rest)
+    return loose

@@ -1109,6 +1109,23 @@ def test_recovery_that_is_never_given_up_survives_any_number_of_errors() -> None
     assert fault.kappa is None and fault.almost_sure.holds
 
 
+@pytest.mark.parametrize(
+    ("final", "back", "kappa"),
+    [("parts == 0", True, None), ("parts == 0 and skipped < 2", False, -1)],
+)
+def test_a_counter_of_errors_that_nothing_reads_is_no_error_state(
+    final: str, back: bool, kappa: int | None
+) -> None:
+    """Its tokens never leave it, so no way led back although the task goes on as before."""
+    net = {
+        "next": {"in": "parts", "out": "grasp"},
+        "grasped": {"in": "grasp:normal"},
+        "missed": {"in": "grasp:error", "out": "skipped"},
+    }
+    (missed,) = judged(make_task("parts=1 grasp! skipped", net, final=final)).recoveries
+    assert (missed.possible.holds, missed.kappa) == (back, kappa)
+
+
 def test_the_shipped_tasks_may_run() -> None:
     for path in sorted(TASKS.glob("*.toml")):
         found = judged(load(path))

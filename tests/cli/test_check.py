@@ -4,6 +4,7 @@ terminal."""
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -226,3 +227,33 @@ def test_run_does_not_repeat_the_search_of_check(
     assert objections(replace(task, final=parse("parts == 9")), cell)
     with pytest.raises(pytest.fail.Exception):
         objections(replace(task, final=parse("parts == 8")), cell)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "judged", "found"),
+    [
+        ("schema = 1", "", True, ("schema", 1, "missing")),
+        (
+            '"control"',
+            "control",
+            True,
+            ("", 10, "not valid TOML: control is a text without quotes"),
+        ),
+        ("[places]", "[places", False, ("", 9, "not valid TOML")),
+        ('"look:normal"', '"zzz:normal"', False, ("transitions.seen.in", 15, "unknown place")),
+    ],
+)
+def test_faults_of_a_file_are_findings_of_the_json(
+    tmp_path: Path, old: str, new: str, judged: bool, found: tuple[str, int, str]
+) -> None:
+    """It was not written beside them."""
+    text = HEAD + 'lost = { in = ["look:error"], out = ["arm"] }\n'
+    (tmp_path / "parts.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    (tmp_path / "services.toml").write_text("[nodes]\n", encoding="utf-8")
+    with contextlib.chdir(tmp_path):
+        assert main(["check", "parts.toml", "--json", "told.json"]) == 2
+    told = json.loads((tmp_path / "told.json").read_text(encoding="utf-8"))
+    assert told["ok"] is False and ("analysis" in told) == judged
+    first = told["findings"][0]
+    assert (first["key"], first["line"]) == found[:2] and first["text"].startswith(found[2])
+    assert any(one["key"] == "services.toml:1: schema" for one in told["findings"])

@@ -1607,6 +1607,12 @@ TOGETHER: list[list[Mistake]] = [
         ),
         (CODE, "from petrobot", "import nothere\nfrom petrobot", r"it imports 'nothere'"),
     ],
+    [  # lines that are no TOML, one below the other: each has a key of its own
+        (TASK, 'fetch = { kind = "action"', "fetch = { kind = action", r"toml:24: .*action is a"),
+        (TASK, 'grip = { kind = "action"', "grip = { kind = action", r"toml:25: .*action is a"),
+        (TASK, 'carry = { kind = "action"', "carry = { kind = action", r"toml:26: .*action is a"),
+        (CELL, "arm_bot:grip", "arm_bot:gripp", r"actions.grip.run: .*'gripp'"),
+    ],
     [  # nothing can be read of the task: its brace ends nowhere
         (TASK, "[transitions]", "[transitions", r"arm_bot.toml:28: not valid TOML"),
         (CELL, "[actions]", "[action]", r"action: unknown table"),

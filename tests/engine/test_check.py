@@ -138,6 +138,15 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "timeless-cycle",
             E,
             "transitions.t",
+            lambda t: t(
+                "x=1 y lid",
+                {"t": {"in": "x !lid*2", "out": "y"}, "u": {"in": "y lid", "out": "x lid"}},
+            ),
+        ),
+        (
+            "timeless-cycle",
+            E,
+            "transitions.t",
             lambda t: t("y", {"t": {"in": "!y", "out": "y"}, "u": {"in": "y"}}),
         ),
         ("external-wait", W, "places.x", lambda t: t("x=1", {"t": {"in": "x", "event": "e"}}, "e")),
@@ -275,11 +284,22 @@ def test_conflicts_of_a_long_task_are_found_soon(task: Tasks) -> None:
     assert effort(160) < 5 * effort(80)
 
 
-@pytest.mark.parametrize("lost", [{}, {"lost": {"in": "q", "out": "c", "event": "g"}}])
+@pytest.mark.parametrize(
+    "lost",
+    [
+        {},
+        {"lost": {"in": "q", "out": "c", "event": "g"}},
+        {
+            "lost": {"in": "q", "out": "c", "event": "g"},
+            "seen": {"in": "c", "out": "c", "event": "g"},
+        },
+    ],
+)
 def test_invariant_that_excludes_two_transitions(
     task: Tasks, lost: dict[str, dict[str, Any]]
 ) -> None:
-    """Also where a token can leave for a control place: it does not come back."""
+    """Also where a token can leave for a control place: it does not come back, even if another
+    transition takes it and puts it back."""
     net = {
         **lost,
         "swap": {"in": "p", "out": "q", "event": "f"},
@@ -314,6 +334,10 @@ def test_invariant_that_excludes_two_transitions(
         ("y", {"t": {"in": "!y*2", "out": "y"}}),
         # the run that it starts inhibits it
         ("a! x", {"t": {"in": "!x !a", "out": "a"}, "u": {"in": "a:normal", "out": "x"}}),
+        (  # the lid is open, or it is not
+            "x=1 a! lid",
+            {"t": {"in": "x !lid", "out": "a"}, "u": {"in": "a:preempt=none lid", "out": "x lid"}},
+        ),
     ],
 )
 def test_a_loop_that_counts_or_bars_itself_is_no_timeless_cycle(

@@ -73,9 +73,14 @@ class OrdinaryView:
 
     @cached_property
     def error_places(self) -> tuple[int, ...]:
-        """Places that only error branches mark."""
-        names = self.task.flat.error_elements
-        return tuple(i for i, name in enumerate(self.task.net.places) if name in names)
+        """Places that only error branches mark, without counters that nothing reads: their tokens
+        stay, and change nothing."""
+        flat, net = self.task.flat, self.task.net
+        read = {net.places[p] for arcs in (*net.consume, *net.inhibit) for p, _ in arcs}
+        for end in (flat.final, flat.final_error):
+            read |= end.names if end is not None else set()
+        names = flat.error_elements & read
+        return tuple(i for i, name in enumerate(net.places) if name in names)
 
     def is_nominal(self, marking: Marking) -> bool:
         """G: no place of an error branch is marked. (No run is ever stopping here: the ordinary net

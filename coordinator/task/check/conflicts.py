@@ -37,7 +37,7 @@ def semiflows(task: Task) -> tuple[Flow, ...]:
     """
     net = task.net
     control = {i for i, p in enumerate(task.places.values()) if p.kind is Kind.CONTROL}
-    taken = {p for arcs in net.consume for p, _ in arcs}
+    taken = {p for changes in net.compiled.changes for p, change in changes if change < 0}
     places = [i for i in range(len(net.places)) if i not in control & taken]
     rows: list[tuple[Flow, dict[int, int]]] = [({p: 1}, _effects(net, p)) for p in places]
     for t in range(len(net.transitions)):
