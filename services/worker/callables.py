@@ -3,6 +3,7 @@ line."""
 
 from __future__ import annotations
 
+import contextlib
 import dis
 import inspect
 import logging
@@ -114,7 +115,8 @@ def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: 
         if from_outside(worse):
             raise
         trace = f"(its traceback cannot be had: {type(worse).__name__})"
-    log.error(f"{text}\n%s", *arguments, trace)
+    with contextlib.suppress(Exception):  # a handler of the user may raise
+        log.error(f"{text}\n%s", *arguments, trace)
 
 
 def _traceback(fault: BaseException) -> str:
