@@ -9,7 +9,7 @@ import math
 
 from petrobot.services.comm.location_file import DeviceEntry, Directory, DirectoryError, resolve
 from petrobot.services.device import Driver, Ports, can_move, faults_of_limits
-from petrobot.services.worker.callables import describe, log_fault
+from petrobot.services.worker.callables import RAISED, describe, log_fault
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
         told = f"is missing {fault}" if isinstance(fault, KeyError) else str(fault)
         remedy = "correct the keys of this table, or the driver"
         raise DirectoryError((f"{here}: {device.driver} refuses it: {told}; {remedy}",)) from fault
-    except Exception as fault:  # not a bad key, which raises one of the above, but a bug
+    except RAISED as fault:  # not a bad key, which raises one of the above, but a bug
         log_fault(_log, fault, "device %s: its driver cannot be made", device.name)
         raise DirectoryError(
             (f"{here}: {device.driver} failed: {describe(fault)}; correct the driver",)

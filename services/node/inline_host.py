@@ -22,7 +22,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
-from petrobot.services.worker.callables import describe, log_fault
+from petrobot.services.worker.callables import RAISED, describe, log_fault
 from petrobot.services.worker.context import Report
 from petrobot.services.worker.remote import (
     BARRED,
@@ -175,7 +175,7 @@ class InlineHost:
                 word, data = self._carry_out(now, command.verb, command.data)
                 self._told.append(answer_of(command.id, word, data))
                 return
-            except Exception as fault:
+            except RAISED as fault:
                 self._fail(now, fault)
         self._told.append(answer_of(command.id, "not ready", {"text": self.failed}))
 
@@ -185,10 +185,10 @@ class InlineHost:
             self._runner.take(now, Cancel(run, stop_reason(cause, BARRED[cause])))
         try:
             self._stop_driver(now, cause)
-        except Exception as fault:
+        except RAISED as fault:
             self._fail(now, fault)
 
-    def _fail(self, now: float, fault: Exception) -> None:
+    def _fail(self, now: float, fault: BaseException) -> None:
         """End the runs of a driver that raised an exception, and try to stop its device. Raises
         DeviceError if it was the driver's first step, and no run waits: its node does not start."""
         self.failed = f"{self._device}its driver failed: {describe(fault)}"
@@ -198,7 +198,7 @@ class InlineHost:
         self._told += self._runner.reports()
         self._told += self._runner.give_up_all(now, self.failed)
         if driver is not None:
-            with contextlib.suppress(Exception):
+            with contextlib.suppress(*RAISED):
                 stop_at_once(driver, now)
             if driver.period and starting:
                 raise DeviceError(self.failed) from fault
@@ -271,8 +271,8 @@ class InlineHost:
         try:
             self._advance(now)
         except (
-            Exception
-        ) as fault:  # code of actions is guarded where it is called: this was the driver's
+            RAISED
+        ) as fault:  # code of actions is guarded where it is called: it was the driver's
             self._fail(now, fault)
 
     def _advance(self, now: float) -> None:
@@ -326,5 +326,5 @@ class InlineHost:
             try:
                 self._driver.stop(now)
                 self._driver.close()
-            except Exception as fault:
+            except RAISED as fault:
                 log_fault(_log, fault, "a driver failed while it was being closed")

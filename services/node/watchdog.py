@@ -1,6 +1,9 @@
 """Interrupts code that hangs in lock step: code that does not return would stop simulated time for
 ever, and there is no other process that could end it.
 
+The same process runs everything in lock step, so code that ends it would end the command without a
+word. `os._exit` raises SystemExit there instead, and Python names the line at a crash.
+
 A thread checks the current step of a node. It counts the processor time that the step has used and
 the time that it slept. On a busy machine a step that does not hang may take long, but then it does
 neither.
@@ -9,6 +12,7 @@ neither.
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import logging
 import os
 import signal
@@ -18,6 +22,7 @@ import time
 import weakref
 from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
 from petrobot.services.worker.callables import is_users
 from petrobot.services.worker.runner import Execution, Hung
@@ -38,6 +43,9 @@ exception. After that the process ends."""
 WAKE = signal.SIGURG
 """Signal that lets a call of the system return, so that the code that waits for it can be
 interrupted. By default a process ignores it."""
+ENDING = (signal.SIGALRM, signal.SIGVTALRM, signal.SIGPROF)
+"""Signals of a process's timers, which end it by default."""
+_exit = os._exit
 _raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
@@ -64,9 +72,10 @@ class Watchdog:
             self._thread.start()
             # Only the main thread runs handlers; another one is interrupted when its call returns.
             main = threading.current_thread() is threading.main_thread()
+            _name_what_ends_the_process()
             if main and signal.getsignal(WAKE) is signal.SIG_DFL:
                 signal.signal(WAKE, lambda *_: None)
-        self._watched = threading.get_ident()
+        self._watched = _steps[os.getpid()] = threading.get_ident()
         # The thread asks for its own clock: asking for that of an ended thread crashes the process.
         self._clock = time.pthread_getcpuclockid(self._watched)
         self._step += 1
@@ -74,6 +83,7 @@ class Watchdog:
     def end(self) -> None:
         """Note that the code has returned."""
         self._step += 1
+        _steps.clear()
 
     def close(self) -> None:
         """Stop watching."""
@@ -112,6 +122,26 @@ class Watchdog:
         # Raised at the thread's next line of Python: that of the signal's handler, if it waits in a
         # call of the system (a sleep, the end of another program).
         signal.pthread_kill(self._watched, WAKE)
+
+
+_steps: dict[int, int] = {}
+"""During a step: the id of its process, and its thread. A copy of the process has another id."""
+
+
+def _exit_aloud(status: int) -> NoReturn:
+    """Stands for `os._exit`."""
+    if _steps.get(os.getpid()) == threading.get_ident():
+        raise SystemExit(f"it called os._exit({status})")
+    _exit(status)
+
+
+def _name_what_ends_the_process() -> None:
+    os._exit = _exit_aloud
+    if not faulthandler.is_enabled() and sys.stderr is sys.__stderr__ is not None:
+        faulthandler.enable(all_threads=False)
+        for number in ENDING:
+            if signal.getsignal(number) is signal.SIG_DFL:
+                faulthandler.register(number, all_threads=False, chain=True)
 
 
 def _look_on(watchdog: weakref.ref[Watchdog], over: threading.Event) -> None:

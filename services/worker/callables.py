@@ -3,6 +3,7 @@ line."""
 
 from __future__ import annotations
 
+import contextlib
 import dis
 import inspect
 import logging
@@ -25,6 +26,9 @@ LONGEST = 2_000
 """Longest description (characters): an exception may quote all of the data that it is about."""
 FRAMES, CHAIN = 50, 8
 """Most frames of one traceback in the log, and most exceptions that led to one another."""
+RAISED = (Exception, SystemExit, GeneratorExit)
+"""What code of a driver may raise: a library of its vendor may call `sys.exit`. (KeyboardInterrupt
+may be a Ctrl-C.)"""
 _RAISE = dis.opmap["RAISE_VARARGS"]
 
 
@@ -114,7 +118,8 @@ def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: 
         if from_outside(worse):
             raise
         trace = f"(its traceback cannot be had: {type(worse).__name__})"
-    log.error(f"{text}\n%s", *arguments, trace)
+    with contextlib.suppress(Exception):  # a handler of the user may raise
+        log.error(f"{text}\n%s", *arguments, trace)
 
 
 def _traceback(fault: BaseException) -> str:

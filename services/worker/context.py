@@ -85,12 +85,13 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Outco
         if type(values) is not dict:
             raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
         _refuse_large(values, where)
-        said = (plain(str(returned.cause)), plain(str(returned.text)))
+        cause = "" if returned.cause is None else plain(str(returned.cause))
+        text = "" if returned.text is None else plain(str(returned.text))
         # Most are members already: to make one of its text takes 1 us.
         status = returned.status if type(returned.status) is Status else Status(returned.status)
         executed = EXECUTED.get(returned.executed) or Executed(returned.executed)
         result = Outcome(
-            identity, status, values, *said, executed, deferred=bool(returned.deferred)
+            identity, status, values, cause, text, executed, deferred=bool(returned.deferred)
         )
         checked(result)
     except (TypeError, ValueError, MemoryError) as fault:

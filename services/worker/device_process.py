@@ -20,7 +20,7 @@ from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
 from petrobot.services.node.emergency_stops import Guard
 from petrobot.services.node.ports import ProcessPorts
-from petrobot.services.worker.callables import describe, log_fault
+from petrobot.services.worker.callables import RAISED, describe, log_fault
 from petrobot.services.worker.pipe import NewestLink, Pipe
 from petrobot.services.worker.remote import (
     BARRED,
@@ -89,13 +89,13 @@ class DeviceLoop:
         gc.freeze()
         try:
             self._step_on()
-        except Exception as fault:
+        except RAISED as fault:
             self._stop_broken()
             raise DeviceError(f"its driver failed: {describe(fault)}") from fault
         finally:
             try:
                 self._driver.close()
-            except Exception as fault:
+            except RAISED as fault:
                 log_fault(_log, fault, "a driver failed while it was being closed")
             if self._worker is not None:
                 self._worker.close()
@@ -109,7 +109,7 @@ class DeviceLoop:
             while (now := time.monotonic()) < end and not self._driver.stopped():
                 self._driver.step(now)
                 time.sleep(self._period)
-        except Exception as fault:
+        except RAISED as fault:
             _log.error("it could not be stopped either: %s", describe(fault))
 
     def _step_on(self) -> None:

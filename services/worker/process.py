@@ -9,6 +9,8 @@ its device's driver and finds it cyclic serves only the driver.
 
 from __future__ import annotations
 
+import _locale
+import builtins
 import logging
 import os
 import resource
@@ -19,13 +21,15 @@ import sys
 import time
 import warnings
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 
 # Its own name, as in `runner`.
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
 from petrobot.services.comm.protocol.messages import (
@@ -98,6 +102,54 @@ class Setup:
         return asdict(self)
 
 
+class Setting(NamedTuple):
+    """A setting of a module that the code of one run may change for the runs after it."""
+
+    module: str
+    read: Callable[[Any], Any]
+    write: Callable[[Any, Any], object]
+    first: Any = None
+    """Its value when the module is imported: a run may be the first to import it."""
+
+
+_HOOKS = ("excepthook", "unraisablehook", "displayhook")
+SETTINGS = (
+    Setting("sys", lambda m: m.getrecursionlimit(), lambda m, v: m.setrecursionlimit(v)),
+    Setting("sys", lambda m: m.getswitchinterval(), lambda m, v: m.setswitchinterval(v)),
+    Setting("sys", lambda m: m.get_int_max_str_digits(), lambda m, v: m.set_int_max_str_digits(v)),
+    Setting("sys", attrgetter(*_HOOKS), lambda m, v: vars(m).update(zip(_HOOKS, v, strict=True))),
+    Setting("threading", attrgetter("excepthook"), lambda m, v: setattr(m, "excepthook", v)),
+    Setting("gc", lambda m: m.isenabled(), lambda m, v: m.enable() if v else m.disable()),
+    Setting("logging", attrgetter("root.manager.disable"), lambda m, v: m.disable(v)),
+    Setting("socket", lambda m: m.getdefaulttimeout(), lambda m, v: m.setdefaulttimeout(v)),
+    Setting("warnings", lambda m: list(m.filters), lambda m, v: _set_filters(v)),
+    Setting("tempfile", attrgetter("tempdir"), lambda m, v: setattr(m, "tempdir", v)),
+    Setting(
+        "locale",
+        lambda m: m.setlocale(m.LC_ALL),
+        lambda m, v: m.setlocale(m.LC_ALL, v),
+        _locale.setlocale(_locale.LC_ALL, None),
+    ),
+    # Of its context only copies are kept, and no copy is equal to another.
+    Setting(
+        "decimal",
+        lambda m: m.getcontext().copy(),
+        lambda m, v: m.setcontext((v or m.DefaultContext).copy()),
+    ),
+    Setting(
+        "numpy",
+        lambda m: m.geterr(),
+        lambda m, v: m.seterr(**v),
+        {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"},
+    ),
+)
+
+
+def _set_filters(filters: Sequence[Any]) -> None:
+    warnings.resetwarnings()
+    warnings.filters = list(filters)
+
+
 class Surroundings:
     """What the code of one run may change for the runs after it, so that they would fail. What was
     there is put back; what it has added to the environment or the import path stays: it may have
@@ -107,6 +159,7 @@ class Surroundings:
         getattr(resource, f"RLIMIT_{name}")
         for name in ("AS", "CPU", "DATA", "FSIZE", "NOFILE", "NPROC", "STACK")
     )
+    _NOFILE = LIMITS.index(resource.RLIMIT_NOFILE)
     TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
     SIGNALS = (signal.SIGCHLD, signal.SIGPIPE, signal.SIGALRM)
 
@@ -115,16 +168,20 @@ class Surroundings:
         self._folder = self._here()
         self._mask = os.umask(0)
         os.umask(self._mask)
-        self._depth = sys.getrecursionlimit()
+        self._settings = [
+            each.read(sys.modules[each.module]) if each.module in sys.modules else each.first
+            for each in SETTINGS
+        ]
+        self._builtins = dict(vars(builtins))
+        self._built_in = list(self._builtins.values())
+        self._processors, self._rights = os.sched_getaffinity(0), self._own_rights()
+        self._signals = signal.pthread_sigmask(signal.SIG_BLOCK, ())
         self._streams = (sys.stdin, sys.stdout, sys.stderr)
         self._limits = [resource.getrlimit(limit) for limit in self.LIMITS]
-        self._files = self._standard_files()
+        self._files, self._any_file = self._standard_files(), os.open("/", os.O_CLOEXEC)
+        self._first_file = self._next_file()
         self._environment, self._path = dict(vars(os.environ)["_data"]), sys.path[:]
         self._handlers = [signal.getsignal(number) for number in self.SIGNALS]
-        self._filters, self._timeout = list(warnings.filters), socket.getdefaulttimeout()
-        # Not imported here: a node in real time starts in half the time without it.
-        self._numpy = sys.modules.get("numpy")
-        self._numbers = self._numpy.geterr() if self._numpy else {}
 
     def restored(self) -> str:
         """Make them so again. Return why that is not possible, empty if it is."""
@@ -132,9 +189,12 @@ class Surroundings:
         sys.stdin, sys.stdout, sys.stderr = self._streams
         if any(stream is not None and stream.closed for stream in self._streams):
             return "it has closed a standard stream"
-        if sys.getrecursionlimit() != self._depth:
-            sys.setrecursionlimit(self._depth)
         try:
+            if self._own_rights() != self._rights:
+                return "it has changed its user or priority"
+            signal.pthread_sigmask(signal.SIG_SETMASK, self._signals)
+            if os.sched_getaffinity(0) != self._processors:
+                os.sched_setaffinity(0, self._processors)
             for timer in self.TIMERS:
                 if signal.getitimer(timer) != (0.0, 0.0):
                     signal.setitimer(timer, 0.0)
@@ -145,6 +205,8 @@ class Surroundings:
                 os.chdir(self._folder)
             if self._standard_files() != self._files:
                 return "it has closed the file of a standard stream"
+            if 2 * self._next_file() > self._first_file + self._limits[self._NOFILE][0]:
+                return "it has left so many files open that later runs might find no more"
             self._restore_modules()
         except (OSError, TypeError, ValueError) as fault:
             return str(fault)
@@ -164,13 +226,23 @@ class Surroundings:
         for number, handler in zip(self.SIGNALS, self._handlers, strict=True):
             if signal.getsignal(number) is not handler:
                 signal.signal(number, handler)
-        if warnings.filters != self._filters:
-            warnings.resetwarnings()
-            warnings.filters = list(self._filters)
-        if socket.getdefaulttimeout() != self._timeout:
-            socket.setdefaulttimeout(self._timeout)
-        if self._numpy and self._numpy.geterr() != self._numbers:
-            self._numpy.seterr(**self._numbers)
+        found = sys.modules
+        for each, wanted in zip(SETTINGS, self._settings, strict=True):
+            module = found.get(each.module)
+            if module is not None and each.read(module) != wanted:
+                each.write(module, wanted)
+        if list(islice(vars(builtins).values(), len(self._built_in))) != self._built_in:
+            vars(builtins).update(self._builtins)
+
+    @staticmethod
+    def _own_rights() -> tuple[int, ...]:
+        return *os.getresuid(), *os.getresgid(), os.getpriority(os.PRIO_PROCESS, 0)
+
+    def _next_file(self) -> int:
+        """Return the number of the next file that is opened."""
+        number = os.dup(self._any_file)
+        os.close(number)
+        return number
 
     @staticmethod
     def _standard_files() -> list[tuple[int, int] | None]:
@@ -239,6 +311,8 @@ class Worker:
         process then ends no other run. The calls behind it have not begun, and the node gives them
         to another worker."""
         self._surroundings = Surroundings()
+        self._used = False
+        """Whether a run may have changed the surroundings."""
         self._calls: deque[Call] = deque()
         self._spent = False
         """Whether a run used up the memory, so that the next one needs a new process."""
@@ -282,6 +356,8 @@ class Worker:
                 self._advance(monotonic())
             if self._calls:
                 self._give_back()
+            if not self._place.runs:
+                self._restore()  # now, so that the next call need not wait for it
             if self._changed and not self._node.unsent:
                 os._exit(CHANGED)
         self._place.close(monotonic())
@@ -304,15 +380,21 @@ class Worker:
     def _begin(self, now: float, call: Call) -> None:
         """Begin a call, unless the node has taken it back, or this process cannot be made as it was
         for its first run."""
-        if self._one_by_one and (why := self._surroundings.restored()):
-            _log.warning("a run has changed this process for good: %s", why)
+        self._restore()
+        if self._changed:
             self._calls.appendleft(call)
-            self._spent = self._changed = True
-            return
-        if self._permits.take():
+        elif self._permits.take():
+            self._used = self._one_by_one
             self._place.take(now, call)
         else:
             self._node.post([DROPPED, [call.id]])
+
+    def _restore(self) -> None:
+        """Undo what the last run has changed in this process."""
+        if self._used and (why := self._surroundings.restored()):
+            _log.warning("a run has changed this process for good: %s", why)
+            self._spent = self._changed = True
+        self._used = False
 
     def _give_back(self) -> None:
         """Give back the calls that would have to wait here. Those without a permit were already

@@ -14,7 +14,7 @@ from petrobot.services.comm.protocol.messages import EMERGENCY_STOP as EMERGENCY
 from petrobot.services.comm.protocol.messages import SEED
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.device import Driver, stop_at_once
-from petrobot.services.worker.callables import describe, log_fault, words_of
+from petrobot.services.worker.callables import RAISED, describe, log_fault, words_of
 
 _log = logging.getLogger(__name__)
 
@@ -249,7 +249,7 @@ class CyclicDriver:
             self.driver.command(now, command.body)
         except ValueError as fault:
             self._refuse(command, words_of(fault) or type(fault).__name__)
-        except Exception as fault:
+        except RAISED as fault:
             log_fault(_log, fault, "a driver failed on the command %.200r", command.body)
             self._refuse(command, describe(fault))
 

@@ -31,6 +31,7 @@ pytestmark = pytest.mark.processes
 FAULTS = {
     "step": "LookupError: nothing is right in step",
     "state": "LookupError: nothing is right in state",
+    "leaves": "SystemExit: the vendor's library gave up in step (drivers.py:",
     "stopped": "LookupError: nothing is right in stopped",
     "not_plain": "state.arm.pose: a object is not plain data",
     "surrogate": "surrogates not allowed",

@@ -176,20 +176,25 @@ RUN = textwrap.dedent("""\
 """)
 
 
-@pytest.mark.processes
-@pytest.mark.parametrize("how", ["loop", "program", "stubborn"])
-def test_an_action_that_does_not_return_is_named(tmp_path: Path, how: str) -> None:
-    """Also one that waits for another program. Its run ends in ERROR, or, if it cannot be
-    interrupted, its process ends. The message names node, action, run and line."""
-    file = tmp_path / "services.toml"
+def _run_spin(folder: Path, how: str) -> subprocess.CompletedProcess[str]:
+    file = folder / "services.toml"
     file.write_text(HANGING.format(port=free_ports(1)[0], how=how))
-    done = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-c", RUN, str(file)],
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
         capture_output=True,
         text=True,
         timeout=PATIENCE,
+        check=False,
     )
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("how", ["loop", "program", "stubborn"])
+def test_an_action_that_does_not_return_is_named(tmp_path: Path, how: str) -> None:
+    """Also one that waits for another program. Its run ends in ERROR, or, if it cannot be
+    interrupted, its process ends. The message names node, action, run and line."""
+    done = _run_spin(tmp_path, how)
     said = done.stderr
     assert "node only: action spin, run m/p#1, in turn_round (" in said and "actions.py:" in said, (
         done
@@ -252,6 +257,17 @@ def test_ctrl_c_of_the_user_is_not_confused_with_the_watchdogs(by: str) -> None:
             )
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("how", ["exit", "timer", "crash"])
+def test_an_action_that_ends_the_process_is_named(tmp_path: Path, how: str) -> None:
+    """`os._exit` ends only the run; a crash or a timer ends the process with the line."""
+    done = _run_spin(tmp_path, how)
+    if how == "exit":
+        assert done.stdout.startswith("error exception SystemExit: it called os._exit(0)"), done
+    else:
+        assert done.returncode < 0 and 'actions.py", line' in done.stderr, done
 
 
 def test_an_ended_thread_does_not_crash_the_watchdog() -> None:

@@ -172,3 +172,13 @@ async def test_the_level_holds_for_the_node_and_its_processes(
     assert ("bytes: Call operator/" in log) == ("from " in log) == (level == "debug")
     assert (" INFO " in log) == (level == "debug") and shown in log
     assert "ZeroDivisionError: nothing is divided by nothing" in log and "starting it again" in log
+
+
+def test_a_handler_that_raises_ends_no_process() -> None:
+    class Broken(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            raise ZeroDivisionError
+
+    log = logging.Logger("apart")
+    log.addHandler(Broken())
+    log_fault(log, ValueError("x"), "it failed")

@@ -100,6 +100,7 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
     (doubled, {"x": 4}, "success", "", "", "yes"),
     (lambda ctx: failure("dark", "too dark", light=0.1), {}, "failure", "dark", "too dark", "yes"),
     (lambda ctx: error("lost"), {}, "error", "lost", "", "yes"),
+    (lambda ctx: error(None), {}, "error", "", "", "yes"),  # type: ignore[arg-type]
     (naps, {}, "success", "", "", "yes"),
     (raises, {}, "error", "exception", "KeyError: 'missing' in raises (test_runner.py:", "yes"),
     (

@@ -3,7 +3,11 @@ memory."""
 
 from __future__ import annotations
 
+import builtins
 import ctypes
+import decimal
+import gc
+import logging
 import multiprocessing
 import os
 import resource
@@ -11,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -45,6 +50,15 @@ CHANGES: dict[str, Callable[[], Any]] = {
     "warnings": lambda: warnings.simplefilter("error"),
     "sockets": lambda: socket.setdefaulttimeout(1e-6),
     "numbers": lambda: np.seterr(all="raise"),
+    "hook": lambda: setattr(sys, "excepthook", None),
+    "precision": lambda: setattr(decimal.getcontext(), "prec", 2),
+    "temporary files": lambda: setattr(tempfile, "tempdir", "/nowhere"),
+    "built-in": lambda: setattr(builtins, "open", None),
+    "collector": gc.disable,
+    "silence": lambda: logging.disable(logging.CRITICAL),
+    "processor": lambda: os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1]),
+    "signals": lambda: signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM]),
+    "priority": lambda: os.nice(1),
     "files": lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (5, 1024)),
 }
 """What an action may leave behind in its process."""
@@ -60,6 +74,10 @@ def change(ctx: Context, *, what: str = "") -> Result:
     found += [os.environ["PATH"], bool(sys.path), str(signal.getsignal(signal.SIGCHLD))]
     found += [[each[0] for each in warnings.filters], socket.getdefaulttimeout(), np.geterr()]
     found.append([Path(f"/proc/self/fd/{number}").exists() for number in range(3)])
+    found += [sys.excepthook is sys.__excepthook__, decimal.getcontext().prec]
+    found += [tempfile.gettempdir(), open is not None, gc.isenabled()]
+    found += [logging.root.manager.disable, sorted(os.sched_getaffinity(0)), os.nice(0)]
+    found.append(len(signal.pthread_sigmask(signal.SIG_BLOCK, ())))
     CHANGES[what]()
     return success(found=found, pid=os.getpid())
 
@@ -409,5 +427,11 @@ def turn_round(how: str) -> None:
     """Loop without end, or wait for a program that does not end in time."""
     if how == "program":
         subprocess.run(["sleep", "60"], check=True)
+    if how == "exit":
+        os._exit(0)
+    if how == "timer":
+        signal.setitimer(signal.ITIMER_REAL, 0.01)
+    if how == "crash":
+        os.abort()
     while True:
         pass

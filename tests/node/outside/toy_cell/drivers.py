@@ -184,6 +184,8 @@ class Broken:
     def step(self, now: float) -> None:
         """Record whether it moves."""
         self._fail("step")
+        if self._armed and self._breaks == "leaves":
+            raise SystemExit("the vendor's library gave up")
         if self._armed and self._breaks == "event":
             self._ports.raise_event("e" * 300)
         self._note()
