@@ -153,10 +153,10 @@ def analyse_command(
         with until(due, clock):
             analyses[-1], data, said = _told(analyses[-1], structure)
             if wanted:
-                now, then = analyses
+                now, as_it_is, _ = _told(analyses[0], False)
                 what = [change.text for change in wanted]
-                data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
-                said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
+                data |= {"what_if": what, "as_it_is": as_it_is}
+                said += ["", f"what if {', '.join(what)}:", *_compared(now, analyses[-1])]
             if expressions:
                 data["measures"], lines = _tell_measures(expressions, analyses)
                 said += lines
@@ -309,7 +309,10 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
         )
         if before.holds is not after.holds
     ]
-    one, other = now.figures(), then.figures()
+    try:
+        one, other = now.figures(), then.figures()
+    except OutOfTime:
+        one, other = {}, {}
     rows += [(name, f"{one[name]:.6g}", f"{other[name]:.6g}") for name in one if name in other]
     lines = [f"  {'':28}{'as it is':>14}{'what if':>14}"]
     return [*lines, *(f"  {name:28}{before:>14}{after:>14}" for name, before, after in rows)]

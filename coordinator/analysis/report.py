@@ -732,12 +732,12 @@ def _forecast(
     try:
         view = stochastic_view(task, measured, stages=stages, devices=devices)
         found = forecast(view, limits=limits)
+        _ = found.worth, found.recovery_time, found.throughput, found.mean_tokens
     except (ValueError, ArithmeticError, *OUT_OF_MEMORY) as why:
         if INTERRUPTED in str(why):
             raise KeyboardInterrupt from why
         notes.append(f"no forecast: {_why(why)}")
         return None
-    _ = found.worth, found.recovery_time, found.throughput, found.mean_tokens
     return found
 
 

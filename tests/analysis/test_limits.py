@@ -74,6 +74,40 @@ class Brief:
         return 0.0 if self.left >= 0 else 10.0
 
 
+@pytest.mark.parametrize("readings", [10, 100, 250, 600, 2_000, 6_000])
+def test_a_what_if_tells_its_verdicts_whenever_the_time_is_used_up(
+    readings: int, tmp_path: Path
+) -> None:
+    """The analysis of each file is a fact, though the numbers to compare came too late."""
+    path = tmp_path / "task.toml"
+    path.write_text(GRIPS, encoding="utf-8")
+    limits = SearchLimits(seconds=5.0, clock=Brief(readings))
+    outcome = analyse_command(path, view="gspn", changes=["parts=2"], limits=limits)
+    assert "error" not in outcome.data and outcome.data["verdicts"]["bounded"]["holds"]
+    assert outcome.data["as_it_is"]["verdicts"]["bounded"]["holds"]
+    assert "what if parts=2:" in outcome.text
+
+
+GRIPS = """schema = 1
+[task]
+name = "grips"
+final = "parts == 0"
+[primitive_tasks.grip]
+deadline = 5.0
+[primitive_tasks.grip.estimates]
+success = { share = 0.9, mean = 1.0, cv = 0.3 }
+error = { share = 0.1, mean = 1.0, cv = 0.3 }
+[places]
+parts = { kind = "control", tokens = 3 }
+hand = { kind = "resource", tokens = 1 }
+grip = { kind = "action", holds = "hand" }
+[transitions]
+next = { in = ["parts"], out = ["grip"] }
+gripped = { in = ["grip:normal"] }
+lost = { in = ["grip:error"], out = ["parts"] }
+"""
+
+
 def stuck_and_unsafe(tokens: int) -> Net:
     """A counter that empties, and a branch that gets stuck at once: a deadlock is near, and the
     last markings are far."""
