@@ -78,6 +78,8 @@ class DriverCheck:
     faults: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """What was not checked, and why."""
+    busy: list[str] = field(default_factory=list)
+    """What may be a fault of the driver, or only of this computer, which was too busy to tell."""
 
 
 def check_driver(
@@ -774,7 +776,7 @@ class _Check:
             if name == "sleep" and len(waits) < HELD:
                 continue
             if queued > BUSY * ran:
-                self.note(f"{text}, perhaps because this computer is busy")
+                self.found.busy.append(f"{text}, perhaps because this computer is busy")
             else:
                 self.fault(f"{text}: {why}")
         if self.late > LATE_SHARE * self.steps:

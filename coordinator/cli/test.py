@@ -122,8 +122,9 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2, str(fault)) from fault
     except (ValueError, OSError) as fault:
         raise CommandError(2, f"{directory.source}: devices.{options.device}: {fault}") from fault
-    for text in (*found.faults, *found.notes):
+    for text in (*found.faults, *found.notes, *found.busy):
         print(text)
     if not found.faults:
-        print(f"{options.device}: its driver keeps the rules")
+        doubt = ", as far as this busy computer can tell" if found.busy else ""
+        print(f"{options.device}: its driver keeps the rules{doubt}")
     return 1 if found.faults else 0

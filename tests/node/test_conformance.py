@@ -468,9 +468,9 @@ class DrawsByItself(Axis):
 @pytest.mark.usefixtures("ends_processes")
 def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
     check = checked(kind)
-    # On a very busy computer a wait is only noted: it may not be the driver's.
+    # On a very busy computer it cannot be told whose a wait is.
     waiting = kind in (WaitsOnce, WaitsInStop, WaitsForItsThread, ItsThreadKeepsTheLock)
-    found = [*check.faults, *(check.notes if waiting else ())]
+    found = [*check.faults, *(check.busy if waiting else ())]
     assert any(fault in one for one in found), found
     assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
 

@@ -124,7 +124,8 @@ async def test_services_are_answered(
     assert (await ask(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
     refused = await ask(shell, "laboratory_prepare", regime="Q")
     assert refused.status == "error" and "must begin with" in refused.text
-    logged = [record.getMessage() for record in caplog.records if record.name == "petrobot.sim"]
+    told = [record.getMessage() for record in caplog.records if record.name == "petrobot.sim"]
+    logged = [text for text in told if not text.endswith("this host is too busy")]
     assert len(logged) == 2 and logged[0].endswith("of laboratory_prepare ended: success")
     assert "of laboratory_prepare ended: error" in logged[1] and refused.text in logged[1]
 

@@ -242,7 +242,7 @@ class Member:
         delays: Delays | None = None,
         directory: str = "",
         key: Keys | None = None,
-        patience: float = 10.0,
+        patience: float = 30.0,
         joining: float = 60.0,
         listener: socket.socket | None = None,
         returning: Collection[str] = (),

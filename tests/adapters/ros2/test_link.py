@@ -29,7 +29,7 @@ class Stepped(Bridge):
     """A driver that the test steps, on the clock of the process."""
 
     def until(self, condition: Callable[[], object], awaited: str) -> None:
-        limit = Limit(f"{awaited}: {self.state()}", 20.0)
+        limit = Limit(f"{awaited}: {self.state()}")
         while not condition() and limit.left():
             self.ports.now = time.monotonic()  # type: ignore[misc]
             self.step(time.monotonic())
