@@ -19,6 +19,10 @@ from petrobot.coordinator.engine.stimuli import (
 from petrobot.coordinator.task import Counts, End, Kind
 from petrobot.coordinator.task.wording import Severity, nearest
 
+MOST_TOKENS = 1_000_000_000
+"""Most tokens that the operator may put into a place without a capacity: a slip of the finger must
+not become a number that no journal can store."""
+
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
     """Put tokens into a control place, if its capacity allows all of them."""
@@ -26,7 +30,9 @@ def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
     if p is None:
         return
     capacity = draft.compiled.net.capacity[p]
-    if capacity is not None and draft.marking[p] + command.tokens > capacity:
+    if capacity is None:
+        capacity = MOST_TOKENS
+    if draft.marking[p] + command.tokens > capacity:
         refuse(
             draft,
             f"{command.place} holds {draft.marking[p]} tokens and at most {capacity}",
