@@ -17,11 +17,8 @@ from petrobot.coordinator.engine.stimuli import (
     SetBreakpoints,
 )
 from petrobot.coordinator.task import Counts, End, Kind
+from petrobot.coordinator.task.elements import MOST_TOKENS
 from petrobot.coordinator.task.wording import Severity, nearest
-
-MOST_TOKENS = 1_000_000_000
-"""Most tokens that the operator may put into a place without a capacity: a slip of the finger must
-not become a number that no journal can store."""
 
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
