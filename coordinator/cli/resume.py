@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.run.interfaces import Observer
     from petrobot.coordinator.run.journal import Journal
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot resume last --json out.json"
 
@@ -57,6 +58,8 @@ def run(options: argparse.Namespace) -> int:
 
     if mode == "realtime":
         refuse_stopped(found.directory)
+        if changed := changed_file(found.directory):
+            print(changed, file=sys.stderr)
         if later := later_run(found.journal):
             print(
                 f"since {folder.name} was interrupted, {later} has used the same nodes: the "
@@ -70,6 +73,20 @@ def run(options: argparse.Namespace) -> int:
         return resume(found, observers, options.ordered)
 
     return conduct(make, options, mode)
+
+
+def changed_file(recorded: Directory) -> str:
+    """Return a warning if the location file is not the one with which the run began."""
+    from petrobot.services.comm.location_file import DirectoryError, load
+
+    with contextlib.suppress(DirectoryError, OSError):
+        if load(recorded.source).hash != recorded.hash:
+            return (
+                f"{recorded.source} has changed since this run began, and a run continues with the "
+                "file of its beginning: if a node refuses it or does not answer, put that one "
+                "back and start the nodes again"
+            )
+    return ""
 
 
 def later_run(journal: Journal) -> str:

@@ -17,6 +17,7 @@ from petrobot.coordinator.engine.stimuli import (
     SetBreakpoints,
 )
 from petrobot.coordinator.task import Counts, End, Kind
+from petrobot.coordinator.task.elements import MOST_TOKENS
 from petrobot.coordinator.task.wording import Severity, nearest
 
 
@@ -26,7 +27,9 @@ def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
     if p is None:
         return
     capacity = draft.compiled.net.capacity[p]
-    if capacity is not None and draft.marking[p] + command.tokens > capacity:
+    if capacity is None:
+        capacity = MOST_TOKENS
+    if draft.marking[p] + command.tokens > capacity:
         refuse(
             draft,
             f"{command.place} holds {draft.marking[p]} tokens and at most {capacity}",

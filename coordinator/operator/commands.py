@@ -43,7 +43,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Stage
 from petrobot.coordinator.run.realtime import credentials_of
-from petrobot.coordinator.run.recording import JournalStore
+from petrobot.coordinator.run.recording import JournalStore, digest
 from petrobot.coordinator.task import Scope, Task
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Feedback
@@ -283,6 +283,10 @@ class Operation:
         early = self.mission.stage in _BEFORE and isinstance(stimulus, _MAY_COME_EARLY)
         if self.mission.stage is not Stage.RUNNING and not early:
             return refusal("idle", f"the mission run is {self.mission.stage.value}")
+        try:
+            digest([stimulus])
+        except (OverflowError, UnicodeEncodeError) as fault:
+            return refusal("bad_data", f"no journal can store this: {fault}")
         self._refusals.clear()
         try:
             self.executor.stimulate(self.shell.now(), stimulus)

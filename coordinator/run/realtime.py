@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from shlex import quote
 from typing import Final
 
-from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
@@ -337,7 +336,7 @@ class RealtimeMission:
     def _guarded(self, step: Callable[[float], None]) -> None:
         try:
             step(self._loop.time())
-        except (MissionError, JournalError) as fault:
+        except Exception as fault:  # also one of petrobot: without this step the run would hang
             # What is not stored has not left: the nodes end its runs as orphans, and `resume`
             # continues from what is stored.
             self.fail(fault)

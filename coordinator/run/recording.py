@@ -84,11 +84,10 @@ class TakeOver:
         return f"another coordinator continues the run (epoch {self.epoch})"
 
 
-def digest(instructions: Sequence[Instruction]) -> int:
-    """Return the CRC-32 of the instructions as plain data, which replay compares."""
-    packed: bytes = msgpack.packb(
-        [to_plain(instruction) for instruction in instructions], use_bin_type=True
-    )
+def digest(records: Sequence[Instruction | Stimulus]) -> int:
+    """Return the CRC-32 of the instructions as plain data, which replay compares. Raises
+    OverflowError and UnicodeEncodeError for what no journal can store."""
+    packed: bytes = msgpack.packb([to_plain(record) for record in records], use_bin_type=True)
     return zlib.crc32(packed)
 
 
@@ -107,14 +106,18 @@ class JournalStore:
         self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
     ) -> None:
         """Write a stimulus and its effects with the next sync; `t` is the time since the journal's
-        origin (s)."""
-        data = {
-            "t": round(now - self.origin, 6),
-            "stimulus": to_plain(stimulus),
-            "marking": list(state.marking),
-            "instructions": digest(instructions),
-        }
-        self.record(STIMULUS, data)
+        origin (s). Raises JournalError for what no journal can store: the run cannot continue
+        without it."""
+        try:
+            data = {
+                "t": round(now - self.origin, 6),
+                "stimulus": to_plain(stimulus),
+                "marking": list(state.marking),
+                "instructions": digest(instructions),
+            }
+            self.record(STIMULUS, data)
+        except (OverflowError, UnicodeEncodeError) as fault:
+            raise JournalError(f"{type(stimulus).__name__} cannot be stored: {fault}") from fault
 
     def record(self, kind: str, data: Mapping[str, Any]) -> None:
         """Write a record of any kind with the next sync."""

@@ -159,6 +159,11 @@ class Reference:
     variable: str
 
 
+MOST_TOKENS = 1_000_000_000
+"""Most tokens that a task file or the operator may put into a place: a slip of the finger must not
+become a number that no journal can store."""
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """A place of the net. `x`, `y` are its drawing position (drawing units; y grows downwards)."""

@@ -15,6 +15,7 @@ from math import inf, isfinite, prod
 from petrobot.coordinator.task.conditions import Expression, Literal, Name, walk
 from petrobot.coordinator.task.conditions.regions import Domain, kind_faults
 from petrobot.coordinator.task.elements import (
+    MOST_TOKENS,
     EarlyEvent,
     End,
     Event,
@@ -387,8 +388,10 @@ def _argument_of_macro(
 
 
 def _place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
-    if p.tokens < 0:
-        yield Fault(f"{key}.tokens", f"expected 0 or more tokens, got {p.tokens}", "give 0 or more")
+    if not 0 <= p.tokens <= MOST_TOKENS:
+        expected = "0 or more tokens" if p.tokens < 0 else f"at most {MOST_TOKENS:,} tokens"
+        remedy = "give 0 or more" if p.tokens < 0 else "give fewer"
+        yield Fault(f"{key}.tokens", f"expected {expected}, got {p.tokens}", remedy)
     if p.capacity is not None and p.capacity < max(1, p.tokens):
         yield Fault(
             f"{key}.capacity",

@@ -37,7 +37,11 @@ def read_toml(text: str | bytes, source: str) -> dict[str, Any]:
             raise not_utf8(error, source) from error
     text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     try:
-        return tomllib.loads(text)
+        data = tomllib.loads(text)
+        if key := _too_large(data, ""):
+            line = line_of(key, key_lines(text))
+            raise TomlError(source, line, key, "needs more than 64 bits", "write a smaller number")
+        return data
     except tomllib.TOMLDecodeError as error:
         raise TomlError(source, *_syntax_fault(text, str(error))) from error
     except RecursionError as error:
@@ -48,6 +52,19 @@ def not_utf8(error: UnicodeDecodeError, source: str) -> TomlError:
     """Return the fault of a text that is not UTF-8."""
     line = error.object.count(b"\n", 0, error.start) + 1
     return TomlError(source, line, "file", "is not UTF-8", "save it as UTF-8")
+
+
+def _too_large(value: Any, key: str) -> str:
+    """Return the key of the first whole number that TOML does not have (it has those of 64 bits),
+    and no journal can store; tomllib accepts any. Empty if there is none."""
+    if isinstance(value, dict):
+        found = (_too_large(each, f"{key}.{name}") for name, each in value.items())
+    elif isinstance(value, list):
+        found = (_too_large(each, key) for each in value)
+    else:
+        too_large = isinstance(value, int) and not -(2**63) <= value < 2**63
+        return key.removeprefix(".") if too_large else ""
+    return next((each for each in found if each), "")
 
 
 def key_lines(text: str) -> dict[str, int]:

@@ -44,6 +44,12 @@ IN_THE_TASK: list[Mistake] = [
         'kind = "resource"',
         r":LINE: places.axis: it never holds a token; so .*start, .* can never fire, and .*fetch",
     ),
+    (
+        TASK,
+        'kind = "resource", tokens = 1',
+        'kind = "resource", tokens = 9000000000',
+        r":LINE: places.axis.tokens: expected at most 1,000,000,000 tokens, got 9000000000",
+    ),
     (TASK, "[task]", "[tsk]", r":LINE: tsk: unknown key.*did you mean 'task'\?"),
     (TASK, 'final = "parts == 0"', "", r":5: task.final: missing; give a text"),
     (TASK, '"parts == 0"', '"part == 0"', r":LINE: task.final: in 'part == 0'.*'part'.*parts"),

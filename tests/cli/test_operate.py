@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import COMMANDS, main
-from petrobot.coordinator.cli.resume import later_run
+from petrobot.coordinator.cli.resume import changed_file, later_run
 from petrobot.coordinator.engine import Mode
 from petrobot.coordinator.operator.run_address import (
     ADDRESS_FILE,
@@ -26,6 +26,7 @@ from petrobot.coordinator.page import app_state
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.recording import remarks
+from petrobot.services.comm.location_file import load
 from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
@@ -90,6 +91,17 @@ def test_a_resume_names_the_run_that_has_used_the_devices_since(
     os.utime(own, (1_000.0, 1_000.0))
     os.utime(other, (1_005.0 - age, 1_005.0 - age))
     assert later_run(read_journal(own)) == told
+
+
+def test_a_resume_warns_of_a_changed_location_file(tmp_path: Path) -> None:
+    file = tmp_path / "services.toml"
+    file.write_text('schema = 1\n[nodes]\na = { host = "127.0.0.1", port = 7001 }\n')
+    began = load(file)
+    assert changed_file(began) == ""
+    file.write_text(file.read_text() + 'b = { host = "127.0.0.1", port = 7002 }\n')
+    assert str(file) in changed_file(began)
+    file.unlink()
+    assert changed_file(began) == ""
 
 
 async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
@@ -203,6 +215,24 @@ async def test_a_remark_is_one_plain_line(petrobot: Terminal, text: str) -> None
     said = await petrobot("remark", text)
     assert said.code == 2 and "text: expected" in said.err
     assert remarks(read_journal(petrobot.runs / RUN / JOURNAL)) == []
+
+
+async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot: Terminal) -> None:
+    """Without its record, the run could not store anything after it either."""
+    await petrobot.working()
+    operation = petrobot.operation
+    who = operation.controls.holder or "ben"
+    assert (await operation.command(who, "take_controls", {}))["ok"]
+    for verb, data in (
+        ("add_tokens", {"place": "stock", "count": 10**30}),
+        ("remove_tokens", {"place": "stock", "count": 10**30}),
+        ("force_exit", {"transition": "\ud800"}),
+        ("breakpoint", {"element": "t.\ud800"}),
+    ):
+        answer = await operation.command(who, verb, data)
+        assert (answer["ok"], answer["code"]) == (False, "bad_data"), (verb, answer)
+    assert (await operation.command(who, "remark", {"text": "still works"}))["ok"]
+    assert (await operation.command(who, "pause", {}))["ok"]
 
 
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:

@@ -214,6 +214,12 @@ def test_added_token_enables_at_once(play: Plays) -> None:
     assert p.fired == ["t"]
 
 
+def test_no_slip_of_the_finger_makes_a_number_that_cannot_be_stored(play: Plays) -> None:
+    p = play("x y", {"t": {"in": "x y", "out": "y"}})
+    p(AddTokens("x", 10**30))
+    assert p.reports == ["refused"] and p.marked == {}
+
+
 def test_removed_token_forgets_the_latched_event_that_waited_with_it(play: Plays) -> None:
     p = play("x=1 a!=1", {"t": {"in": "x a:normal", "event": "e"}}, "e*")
     p(EventOccurred("e"), RemoveTokens("x"))
