@@ -661,6 +661,11 @@ def _analyse_task(
     if fewer and not (judgement.interrupted or judgement.objections):
         smaller = _with_fewer_runs(task, progress, limits, steps, devices)
         judgement = replace(judgement, fewer=smaller)
+        runs = task.places.get(task.runs_place)
+        complete = progress is not None and progress.x.complete
+        if runs is not None and runs.tokens > 1 and not smaller and not complete:  # no time was left
+            note = f"with one run more may be known: --what-if {runs.name}=1"
+            judgement = replace(judgement, notes=(*judgement.notes, note))
     if view != "gspn" or judgement.interrupted:
         return judgement
     return with_forecast(

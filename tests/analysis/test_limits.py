@@ -250,6 +250,19 @@ def test_the_execution_graph_ends_with_the_time_of_the_analysis() -> None:
     assert len(late) < len(execute(task))
 
 
+@pytest.mark.parametrize(("runs", "told"), [(400, True), (1, False)])
+def test_a_task_whose_many_runs_are_too_much_is_to_be_tried_with_one(
+    tmp_path: Path, runs: int, told: bool
+) -> None:
+    path = tmp_path / "many.toml"
+    text = CATCH.read_text(encoding="utf-8").replace("tokens = 4", f"tokens = {runs}", 1)
+    path.write_text(text, encoding="utf-8")
+    limits = SearchLimits(seconds=20.0, clock=Steps())
+    found = analyse_command(path, view="ordinary", limits=limits)
+    note = "with one run more may be known: --what-if runs=1"
+    assert (note in found.data["notes"]) == told
+
+
 def test_a_search_without_limits_of_its_own_keeps_the_memory_of_the_analysis() -> None:
     assert explore(kanban(3), engine="numpy").complete
     with until(1.0, lambda: 0.0, memory=1_000_000):
