@@ -661,9 +661,9 @@ def _analyse_task(
     if fewer and not (judgement.interrupted or judgement.objections):
         smaller = _with_fewer_runs(task, progress, limits, steps, devices)
         judgement = replace(judgement, fewer=smaller)
-        runs = task.places.get(task.runs_place)
+        runs = task.places.get(task.runs_place)  # None of them was asked where no time was left.
         complete = progress is not None and progress.x.complete
-        if runs is not None and runs.tokens > 1 and not smaller and not complete:  # no time was left
+        if runs is not None and runs.tokens > 1 and not smaller and not complete:
             note = f"with one run more may be known: --what-if {runs.name}=1"
             judgement = replace(judgement, notes=(*judgement.notes, note))
     if view != "gspn" or judgement.interrupted:
