@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from itertools import product
 from typing import NamedTuple
 
@@ -106,11 +106,16 @@ def arcs_satisfied(draft: Draft, x: CompiledTransition) -> tuple[Run, ...] | Non
     )
 
 
-def awaited_place(draft: Draft, x: CompiledTransition) -> int | None:
+def awaited_place(draft: Draft, x: CompiledTransition, among: Collection[int]) -> int | None:
     """Return the one place of whose tokens the transition has too few while it has all else; None
-    if there is no such place."""
-    short = [p for p, w in x.needs if draft.marking[p] < w]
-    if len(short) != 1 or any(draft.occupied(p) >= k for p, k in x.bars):
+    if there is no such place among these."""
+    short, marking = -1, draft.marking
+    for p, w in x.needs:  # a loop: most transitions lack tokens of several places
+        if marking[p] < w:
+            if short >= 0 or p not in among:
+                return None
+            short = p
+    if short < 0 or any(draft.occupied(p) >= k for p, k in x.bars):
         return None
     if any(flag not in draft.flags for flag in x.flags):
         return None
@@ -120,7 +125,7 @@ def awaited_place(draft: Draft, x: CompiledTransition) -> int | None:
     ready = x.when is None or any(
         _condition_holds(draft, x, runs, tell=False) for runs in _selections(x, eligible)
     )
-    return short[0] if ready else None
+    return short if ready else None
 
 
 def token_enabled(draft: Draft, x: CompiledTransition) -> bool:

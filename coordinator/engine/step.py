@@ -120,8 +120,8 @@ def _note_waits(draft: Draft) -> None:
     places, waits = draft.compiled.net.places, dict[str, Wait]()
     for t, contested in draft.compiled.contested.items():
         x = draft.compiled.transitions[t]
-        p = awaited_place(draft, x)
-        if p is not None and p in contested:
+        p = awaited_place(draft, x, contested)
+        if p is not None:
             new = Wait(places[p], draft.stimuli)
             old = draft.waits.get(x.name, new)
             waits[x.name] = old if old.place == new.place else new
