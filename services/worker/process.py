@@ -102,7 +102,7 @@ class Setup:
         return asdict(self)
 
 
-class Setting(NamedTuple):
+class ModuleSetting(NamedTuple):
     """A setting of a module that the code of one run may change for the runs after it."""
 
     module: str
@@ -114,29 +114,33 @@ class Setting(NamedTuple):
 
 _HOOKS = ("excepthook", "unraisablehook", "displayhook")
 SETTINGS = (
-    Setting("sys", lambda m: m.getrecursionlimit(), lambda m, v: m.setrecursionlimit(v)),
-    Setting("sys", lambda m: m.getswitchinterval(), lambda m, v: m.setswitchinterval(v)),
-    Setting("sys", lambda m: m.get_int_max_str_digits(), lambda m, v: m.set_int_max_str_digits(v)),
-    Setting("sys", attrgetter(*_HOOKS), lambda m, v: vars(m).update(zip(_HOOKS, v, strict=True))),
-    Setting("threading", attrgetter("excepthook"), lambda m, v: setattr(m, "excepthook", v)),
-    Setting("gc", lambda m: m.isenabled(), lambda m, v: m.enable() if v else m.disable()),
-    Setting("logging", attrgetter("root.manager.disable"), lambda m, v: m.disable(v)),
-    Setting("socket", lambda m: m.getdefaulttimeout(), lambda m, v: m.setdefaulttimeout(v)),
-    Setting("warnings", lambda m: list(m.filters), lambda m, v: _set_filters(v)),
-    Setting("tempfile", attrgetter("tempdir"), lambda m, v: setattr(m, "tempdir", v)),
-    Setting(
+    ModuleSetting("sys", lambda m: m.getrecursionlimit(), lambda m, v: m.setrecursionlimit(v)),
+    ModuleSetting("sys", lambda m: m.getswitchinterval(), lambda m, v: m.setswitchinterval(v)),
+    ModuleSetting(
+        "sys", lambda m: m.get_int_max_str_digits(), lambda m, v: m.set_int_max_str_digits(v)
+    ),
+    ModuleSetting(
+        "sys", attrgetter(*_HOOKS), lambda m, v: vars(m).update(zip(_HOOKS, v, strict=True))
+    ),
+    ModuleSetting("threading", attrgetter("excepthook"), lambda m, v: setattr(m, "excepthook", v)),
+    ModuleSetting("gc", lambda m: m.isenabled(), lambda m, v: m.enable() if v else m.disable()),
+    ModuleSetting("logging", attrgetter("root.manager.disable"), lambda m, v: m.disable(v)),
+    ModuleSetting("socket", lambda m: m.getdefaulttimeout(), lambda m, v: m.setdefaulttimeout(v)),
+    ModuleSetting("warnings", lambda m: list(m.filters), lambda m, v: _set_filters(v)),
+    ModuleSetting("tempfile", attrgetter("tempdir"), lambda m, v: setattr(m, "tempdir", v)),
+    ModuleSetting(
         "locale",
         lambda m: m.setlocale(m.LC_ALL),
         lambda m, v: m.setlocale(m.LC_ALL, v),
         _locale.setlocale(_locale.LC_ALL, None),
     ),
     # Of its context only copies are kept, and no copy is equal to another.
-    Setting(
+    ModuleSetting(
         "decimal",
         lambda m: m.getcontext().copy(),
         lambda m, v: m.setcontext((v or m.DefaultContext).copy()),
     ),
-    Setting(
+    ModuleSetting(
         "numpy",
         lambda m: m.geterr(),
         lambda m, v: m.seterr(**v),
