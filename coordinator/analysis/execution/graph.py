@@ -48,11 +48,14 @@ SHOWN = 20
 """The most firings of one stimulus that are written."""
 STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
+MOVES = 3
+"""The most commands of the operator on a path of `with_operator`. A token that he adds can be used
+up and added again, so without this nearly every search would go on to its limit."""
 BETWEEN = 1_000
 """Stimuli and firings between two looks at the clock."""
 QUEUE = 16
-"""So many runs of a state count like one more firing. Else a queue that grows for ever, by a timer
-or by the operator's tokens, reaches thousands of runs, and each stimulus takes as long."""
+"""So many runs of a state count like one more firing. Else a queue that a timer fills for ever
+reaches thousands of runs, and each stimulus takes as long."""
 
 
 TOLD_FIRST, TOLD_LAST = 5, 10
@@ -281,8 +284,8 @@ def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
     from control places, one at a time, within their capacities (without a capacity: up to one more
     than at the beginning).
 
-    The states after one command come first, then those after two, and so on, until some are dead
-    ends or conflicts. The numbers of the given states stay the same.
+    The states after one command come first, then those after two, up to `MOVES`, until some are
+    dead ends or conflicts. The numbers of the given states stay the same.
     """
     search = _Search(
         x.engine,
@@ -331,7 +334,9 @@ class _Search:
         """Explore what the operator's commands add."""
         by_hand, begin, end = [False] * len(x.source), 0, len(x)
         found = x
-        while begin < end and self.handled < limit and not self.late:
+        for _ in range(MOVES):
+            if begin == end or self.handled >= limit or self.late:
+                break
             for i in range(begin, end):
                 if self.handled >= limit:
                     break
@@ -439,4 +444,4 @@ def _endless(said: tuple[Instruction, ...]) -> bool:
     return any(isinstance(i, Report) and i.key == "timeless" for i in said)
 
 
-__all__ = ["STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]
+__all__ = ["MOVES", "STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]
