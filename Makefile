@@ -8,17 +8,19 @@ RUNS ?= 4
 MARKS ?= not proof and not browser
 TYPES := $(BIN)/mypy -p petrobot -p tests -p tools -p experiments
 ROUNDS ?= 20
+EXTRAS := test,oracle,opcua,ros2-dds,cluster,experiment,mcap,parquet,fast
 
 # Empty means not set. The tests start about a thousand processes: without cached bytecode each of
 # them compiles the sources again, which takes as long as all the rest of its start.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test suite load proof lint style bench clean
+.PHONY: help demo test suite peers load proof lint style bench clean
 
 help:
 	@echo "make demo   set up, start the cell's nodes, catch $(RUNS) balls in real time, leave a report"
 	@echo "make test   set up, check style and types, run the tests (goal: 6 minutes on two idle cores)"
 	@echo "make suite  run the tests that need no browser (PYTHON, VENV: on another interpreter; MARKS: which)"
+	@echo "make peers  run the tests beside other packages: oracles, ROS 2, OPC UA, Dask (1 GB of packages)"
 	@echo "make load   repeat the tests that start processes $(ROUNDS) times while every core is busy (hours)"
 	@echo "make proof  check every promised figure in full (hours; resumes where it stopped)"
 	@echo "make bench  measure speed beside others, as ratios"
@@ -49,6 +51,12 @@ test: style
 # What another interpreter has to pass, too: make suite PYTHON=python3.13 VENV=.venv-3.13
 suite: $(VENV)/.ready
 	$(BIN)/pytest -n 4 --dist worksteal -rs -m "$(MARKS)"
+
+# What `make test` skips, because it needs packages that petrobot does not.
+peers: $(VENV)/.ready
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
+	$(BIN)/pytest -n 4 --dist worksteal -rs -m "not proof" \
+	  $$(grep -rlE "importorskip|COMPILED|is not installed" tests --include="test_*.py")
 
 load: $(VENV)/.ready
 	$(BIN)/python -m tools.bench.under_load $(ROUNDS)
