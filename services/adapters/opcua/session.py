@@ -206,7 +206,7 @@ class OpcUaSession(Driver):
         for name, text in self.nodes.items():
             try:
                 node = await _node(client, text)
-                kind = await node.read_data_type_as_variant_type()
+                kind = await _kind(node)
                 heard.names[node.nodeid] = name
                 await subscription.subscribe_data_change(node)
                 nodes[name] = node, kind
@@ -237,6 +237,17 @@ async def _node(client: Any, text: str) -> Any:
     if space.startswith("nsu="):
         text = f"ns={await client.get_namespace_index(space[4:])};{identifier}"
     return client.get_node(text)
+
+
+async def _kind(node: Any) -> Any:
+    """Return the type of a node's values; for an abstract one, such as Number, that of the present
+    value."""
+    from asyncua import ua
+
+    kind = await node.read_data_type_as_variant_type()
+    if kind is ua.VariantType.Variant:
+        kind = (await node.read_data_value()).Value.VariantType
+    return kind
 
 
 class _Notifications:
@@ -306,7 +317,7 @@ async def _changed(node: Any, kind: Any) -> str:
     from asyncua import ua
 
     try:
-        same = await node.read_data_type_as_variant_type() == kind
+        same = await _kind(node) == kind
     except ua.UaStatusCodeError:  # it is gone
         same = False
     return "" if same else f"; {CHANGED}"

@@ -25,7 +25,10 @@ KINDS = {
     "count": ua.VariantType.Int16,
     "speed": ua.VariantType.Float,
     "manner": ua.VariantType.String,
+    "level": ua.VariantType.Double,
 }
+ABSTRACT = {"level": ua.NodeId(ua.ObjectIds.Number)}
+"""Data types that a node declares in place of that of its value."""
 
 
 async def secure(server: Server, certificate: str, key: str, clients: str) -> None:
@@ -75,7 +78,8 @@ async def serve(port: str, *security: str) -> None:
         start = "good" if kind == ua.VariantType.String else 0
         value = bool(start) if kind == ua.VariantType.Boolean else start
         identifier = ua.NodeId(f"Cell.{name}", space)
-        node = await server.nodes.objects.add_variable(identifier, name, value, kind)
+        declared = ABSTRACT.get(name)
+        node = await server.nodes.objects.add_variable(identifier, name, value, kind, declared)
         await node.set_writable()
         nodes[name] = node
     async with server:

@@ -23,7 +23,7 @@ from tests.ports import free_ports
 from tests.waiting import Limit
 
 PLC = Path(__file__).with_name("plc.py")
-NAMES = ("request", "done", "sensor", "count", "speed", "manner")
+NAMES = ("request", "done", "sensor", "count", "speed", "manner", "level")
 NODES = {name: f"ns=2;s=Cell.{name}" for name in NAMES}
 LATIN = {"errors": "surrogateescape"}
 """How asyncua decodes text that is not UTF-8."""
@@ -123,14 +123,16 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
         driver.command(0.0, {"write": {"count": 1}})
     await_(driver, complete, "all values")
     assert driver.stopped() and driver.state()["faults"] == {}
-    assert done(driver, {"count": 7, "speed": 2, "sensor": True, "manner": "silent"}) == ""
+    written = {"count": 7, "speed": 2, "sensor": True, "manner": "silent", "level": 3}
+    assert done(driver, written) == ""
     state = await_(driver, lambda state: state["values"]["manner"] == "silent", "the values")
-    assert state["values"] | {"count": 7, "speed": 2.0, "sensor": True} == state["values"]
+    assert state["values"] | written == state["values"]
     # a value that does not fit its node is refused by name and type; the session continues
     assert "count: expected Int16" in done(driver, {"count": 70000})
     assert "count: expected Int16" in done(driver, {"count": "seven"})
     assert "count: expected Int16" in done(driver, {"count": None})
     assert "sensor: expected Boolean" in done(driver, {"sensor": "false"})  # not True
+    assert "level: expected Double" in done(driver, {"level": "high"})  # declared as Number
     assert done(driver, {"sensor": False}) == "" and done(driver, {"sensor": True}) == ""
     limit = Limit("two events")
     while len(cell.desk.events) < 2 and limit.left():
