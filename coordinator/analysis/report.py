@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
-from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues, in_words
+from petrobot.coordinator.analysis.execution.graph import STEPS, Shared, TooManyValues, in_words
 from petrobot.coordinator.analysis.execution.progress import (
     NAMES,
     Odds,
@@ -620,8 +620,11 @@ def _analyse_task(
     limits: SearchLimits | None,
     steps: int,
     devices: Mapping[str, str] | None,
-    fewer: bool = True,
+    shared: Shared | None = None,
 ) -> Analysis:
+    """Analyse a task. `shared` is that of the same task with more runs; None: it is the first, so
+    that fewer runs may be tried, too."""
+    fewer, shared = shared is None, shared or Shared()
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
     found = _examined(n.net, limits, notes, partial(judged, n))
     progress = None
@@ -632,7 +635,7 @@ def _analyse_task(
             # An unbounded net seldom has a finite execution graph, but its dead ends may be near.
             most = steps if found.bounded.holds is not False else min(steps, LOOK)
             try:
-                progress = progress_of(ordinary, most, measured, devices)
+                progress = progress_of(ordinary, most, measured, devices, shared)
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)
@@ -659,7 +662,7 @@ def _analyse_task(
         n,
     )
     if fewer and not (judgement.interrupted or judgement.objections):
-        smaller = _with_fewer_runs(task, progress, limits, steps, devices)
+        smaller = _with_fewer_runs(task, progress, limits, steps, devices, shared)
         judgement = replace(judgement, fewer=smaller)
         runs = task.places.get(task.runs_place)  # None of them was asked where no time was left.
         complete = progress is not None and progress.x.complete
@@ -679,6 +682,7 @@ def _with_fewer_runs(
     limits: SearchLimits | None,
     steps: int,
     devices: Mapping[str, str] | None,
+    shared: Shared,
 ) -> dict[int, Analysis]:
     """Return the analyses of a task with one run, then two, up to a fault or a graph that is too
     large, within the same limits; empty if its own graph is complete or it does not count runs."""
@@ -688,7 +692,7 @@ def _with_fewer_runs(
     for runs in range(1, min(place.tokens, FEWER + 1)):
         places = {**task.places, place.name: replace(place, tokens=runs)}
         smaller = replace(task, places=places)
-        one = _analyse_task(smaller, "", None, STAGES, limits, steps, devices, fewer=False)
+        one = _analyse_task(smaller, "", None, STAGES, limits, steps, devices, shared)
         found[runs] = one
         if one.objections or one.progress is None or not one.progress.x.complete:
             break

@@ -39,6 +39,7 @@ from petrobot.coordinator.analysis.execution.causes import (
 from petrobot.coordinator.analysis.execution.chain import ExecutionChain, TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import (
     ExecutionGraph,
+    Shared,
     Step,
     execute,
     with_operator,
@@ -948,20 +949,21 @@ def progress_of(
     limit: int,
     measured: Measured | None = None,
     devices: Mapping[str, str] | None = None,
+    shared: Shared | None = None,
 ) -> Progress:
     """Return the verdicts on the execution graph of a task, within a limit in stimuli
-    and firings.
+    and firings. `shared` is for all calls with the same task and other numbers of runs.
 
     `devices` gives the device of each action that has one: two runs never use it at a time.
     Raises TooManyValues.
     """
-    asking = Engine(view.task, devices, Policy(ask_undecided=True))
-    free = execute(view.task, limit=limit, engine=asking)
+    asking, shared = Engine(view.task, devices, Policy(ask_undecided=True)), shared or Shared()
+    free = execute(view.task, limit=limit, engine=asking, shared=shared)
     if not free.contests:
         return Progress(free, view, measured)
     contests = free.contests if free.complete else None
     engine = Engine(view.task, devices)
-    served = execute(view.task, limit=limit, engine=engine, contests=contests)
+    served = execute(view.task, limit=limit, engine=engine, contests=contests, shared=shared)
     return Progress(served, view, measured, Progress(free, view))
 
 
