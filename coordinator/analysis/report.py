@@ -52,7 +52,13 @@ from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import STAGES, stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME, Forecast, forecast
+from petrobot.coordinator.analysis.time.task_forecast import (
+    GOALS,
+    MATTERS,
+    TIME,
+    Forecast,
+    forecast,
+)
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import COLUMNS, wrapped
@@ -456,7 +462,8 @@ class Analysis:
         if self.forecast is None:
             return []
         f, done = self.forecast, self.forecast.done
-        goal = f"R_goal {f.goal_reliability:.6f}, " if f.goal_reliability is not None else ""
+        shown = {n: value for n, value in f.told.items() if n in ("R_goal", GOALS)}
+        goal = f"{_figures(shown)}, " if shown else ""
         rows = [
             f"  {w.place}.{w.action}: {100 * w.time_share:.1f} % of the time; error to success: "
             f"{w.completion_gain:+.2e} complete, {w.goal_gain:+.3f} goals"
@@ -471,14 +478,18 @@ class Analysis:
         several = f" of a mission run of {f.trials} trials" if f.trials > 1 else ""
         head = f"forecast{several}: "
         exact = self.exact.figures if self.exact else {}
-        told = ", ".join(f"{n} {mean:.6g} +- {error:.2g}" for n, (mean, error) in exact.items())
+        names = {} if GOALS in f.told else {GOALS: "R_goal"}
+        told = ", ".join(
+            f"{names.get(n, n)} {mean:.6g} +- {error:.2g}" for n, (mean, error) in exact.items()
+        )
         return [
             "",
             *([f"{head}{told} (mean and standard error with exact times)"] if told else []),
             f"{'with few phases: ' if told else head}P_complete {done.probability:.9f}, {goal}"
             f"R_conj {f.conjunctive_reliability:.6f}",
             time if done.probability else never,
-            *([f"  one trial: {_figures(f.one_trial.figures)}"] if several else []),
+            *([f"  one trial: {_figures(f.one_trial.told)}"] if several else []),
+            *(f"  {text}" for text in f.later),
             *(f"doubtful: {text}" for text in self.doubts),
             *_missing_lines(self),
             *(["worth improving:", *rows] if done.probability else []),

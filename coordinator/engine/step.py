@@ -249,6 +249,8 @@ def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
 
 def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
     """Pause before a transition with a breakpoint, and keep its step. Return whether it paused."""
+    if not draft.breakpoints:
+        return False
     names = [m.transition.name for m in step]
     hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
     if not hit:
@@ -277,7 +279,7 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
     places = draft.compiled.net.places
     entered = [
         places[p]
-        for m in step
+        for m in (step if draft.breakpoints else ())
         for p, _, _ in m.transition.produce
         if places[p] in draft.breakpoints
     ]
