@@ -339,7 +339,8 @@ class Progress:
         marks, found, free = self._marks(awaiting), set[str](), (self._nominal & can)[x.source]
         for n in np.unique(x.label[free]).tolist():
             found |= marks.intersection(x.steps[n].firings)
-        for n in np.unique(x.label[free & ~can[x.target]]).tolist():
+        # After a run that ended in ERROR, an event that was kept may be served in the same step.
+        for n in np.unique(x.label[free & ~x.fails & ~can[x.target]]).tolist():
             cause = x.steps[n].stimulus
             came = cause.event if isinstance(cause, EventOccurred) else None
             fired = x.steps[n].firings
