@@ -569,8 +569,9 @@ def test_r_goal_is_a_probability_although_a_trial_meets_several_goals(parts: int
     once = analyse(text.task(), view="gspn").forecast
     found = analyse(replace(text.task(), goal_transitions=("start", "did")), view="gspn")
     assert once is not None and found.forecast is not None and not found.doubts
+    assert once.goals is not None
     assert once.goals == once.goal_reliability == pytest.approx(once.one_trial.told["R_goal"])
-    assert found.forecast.goals == pytest.approx(1 + once.goal_reliability)
+    assert found.forecast.goals == pytest.approx(1 + once.goals)
     assert found.forecast.goal_reliability == (pytest.approx(1.0) if parts == 1 else None)
     assert found.forecast.one_trial.told["R_goal"] == pytest.approx(1.0)
 
