@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
-from petrobot.coordinator.analysis.execution.graph import STEPS, TooManyValues, in_words
+from petrobot.coordinator.analysis.execution.graph import STEPS, Shared, TooManyValues, in_words
 from petrobot.coordinator.analysis.execution.progress import (
     NAMES,
     Odds,
@@ -52,7 +52,13 @@ from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.measured import Measured
 from petrobot.coordinator.analysis.time.stochastic import STAGES, stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME, Forecast, forecast
+from petrobot.coordinator.analysis.time.task_forecast import (
+    GOALS,
+    MATTERS,
+    TIME,
+    Forecast,
+    forecast,
+)
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import COLUMNS, wrapped
@@ -456,7 +462,8 @@ class Analysis:
         if self.forecast is None:
             return []
         f, done = self.forecast, self.forecast.done
-        goal = f"R_goal {f.goal_reliability:.6f}, " if f.goal_reliability is not None else ""
+        shown = {n: value for n, value in f.told.items() if n in ("R_goal", GOALS)}
+        goal = f"{_figures(shown)}, " if shown else ""
         rows = [
             f"  {w.place}.{w.action}: {100 * w.time_share:.1f} % of the time; error to success: "
             f"{w.completion_gain:+.2e} complete, {w.goal_gain:+.3f} goals"
@@ -471,14 +478,18 @@ class Analysis:
         several = f" of a mission run of {f.trials} trials" if f.trials > 1 else ""
         head = f"forecast{several}: "
         exact = self.exact.figures if self.exact else {}
-        told = ", ".join(f"{n} {mean:.6g} +- {error:.2g}" for n, (mean, error) in exact.items())
+        names = {} if GOALS in f.told else {GOALS: "R_goal"}
+        told = ", ".join(
+            f"{names.get(n, n)} {mean:.6g} +- {error:.2g}" for n, (mean, error) in exact.items()
+        )
         return [
             "",
             *([f"{head}{told} (mean and standard error with exact times)"] if told else []),
             f"{'with few phases: ' if told else head}P_complete {done.probability:.9f}, {goal}"
             f"R_conj {f.conjunctive_reliability:.6f}",
             time if done.probability else never,
-            *([f"  one trial: {_figures(f.one_trial.figures)}"] if several else []),
+            *([f"  one trial: {_figures(f.one_trial.told)}"] if several else []),
+            *(f"  {text}" for text in f.later),
             *(f"doubtful: {text}" for text in self.doubts),
             *_missing_lines(self),
             *(["worth improving:", *rows] if done.probability else []),
@@ -620,8 +631,11 @@ def _analyse_task(
     limits: SearchLimits | None,
     steps: int,
     devices: Mapping[str, str] | None,
-    fewer: bool = True,
+    shared: Shared | None = None,
 ) -> Analysis:
+    """Analyse a task. `shared` is that of the same task with more runs; None: it is the first, so
+    that fewer runs may be tried, too."""
+    fewer, shared = shared is None, shared or Shared()
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
     found = _examined(n.net, limits, notes, partial(judged, n))
     progress = None
@@ -632,7 +646,7 @@ def _analyse_task(
             # An unbounded net seldom has a finite execution graph, but its dead ends may be near.
             most = steps if found.bounded.holds is not False else min(steps, LOOK)
             try:
-                progress = progress_of(ordinary, most, measured, devices)
+                progress = progress_of(ordinary, most, measured, devices, shared)
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)
@@ -659,7 +673,7 @@ def _analyse_task(
         n,
     )
     if fewer and not (judgement.interrupted or judgement.objections):
-        smaller = _with_fewer_runs(task, progress, limits, steps, devices)
+        smaller = _with_fewer_runs(task, progress, limits, steps, devices, shared)
         judgement = replace(judgement, fewer=smaller)
         runs = task.places.get(task.runs_place)  # None of them was asked where no time was left.
         complete = progress is not None and progress.x.complete
@@ -679,6 +693,7 @@ def _with_fewer_runs(
     limits: SearchLimits | None,
     steps: int,
     devices: Mapping[str, str] | None,
+    shared: Shared,
 ) -> dict[int, Analysis]:
     """Return the analyses of a task with one run, then two, up to a fault or a graph that is too
     large, within the same limits; empty if its own graph is complete or it does not count runs."""
@@ -688,7 +703,7 @@ def _with_fewer_runs(
     for runs in range(1, min(place.tokens, FEWER + 1)):
         places = {**task.places, place.name: replace(place, tokens=runs)}
         smaller = replace(task, places=places)
-        one = _analyse_task(smaller, "", None, STAGES, limits, steps, devices, fewer=False)
+        one = _analyse_task(smaller, "", None, STAGES, limits, steps, devices, shared)
         found[runs] = one
         if one.objections or one.progress is None or not one.progress.x.complete:
             break

@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="CHANGE",
-        help="judge a change beside the file as it is: runs=10, "
+        help="judge a change beside the file as it is: runs=10 (tokens of that place), "
         "locate_ball.error.share=0.05, serve.rate=2 (may be repeated)",
     )
     add_estimates_argument(parser)

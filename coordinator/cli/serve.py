@@ -36,6 +36,8 @@ ESTIMATES = Path("estimates")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    # Taken only to say what was probably meant.
+    parser.add_argument("task", nargs="?", help=argparse.SUPPRESS)
     add_services_argument(parser)
     parser.add_argument(
         "--tasks",
@@ -70,6 +72,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
+    if options.task is not None:
+        raise CommandError(
+            2,
+            f"expected no task, got {options.task!r}: choose it on the page (its file must be in "
+            f"--tasks FOLDER), or run it with a page of its own: petrobot run {options.task} --up",
+        )
     if options.mock is not None and not options.up:
         raise CommandError(2, "--mock replaces actions of nodes that are started here: add --up")
     directory = load_directory(options.services, options.dry_run)

@@ -100,7 +100,8 @@ class Draft:
     def touch(self, place: int) -> None:
         """Note that tokens, runs or free capacity of the place have changed."""
         self.dirty.update(self.compiled.touching[place])
-        self.retime.update(self.compiled.timed[place])
+        if timed := self.compiled.timed[place]:
+            self.retime.update(timed)
 
     def touch_all(self) -> None:
         """Note that anything may have changed."""

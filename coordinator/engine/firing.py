@@ -244,7 +244,10 @@ def _tokens(place: str, wanted: int, held: int) -> str:
 def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
     """Return the runs that the arc may take, in the order in which they ended or, for active ones,
     started. With `heard`, only runs that raised the events of the arc."""
-    runs = [r for r in draft.tokens.get(arc.name, ()) if _fits(arc, r) and r.id not in claims.runs]
+    present = draft.tokens.get(arc.name)
+    if not present:
+        return []
+    runs = [r for r in present if _fits(arc, r) and r.id not in claims.runs]
     if heard and arc.raised:
         runs = [
             r
@@ -350,7 +353,7 @@ def _marking_allows(draft: Draft, x: CompiledTransition, claims: Claims) -> bool
         if marking[p] - used.get(p, 0) < w:
             return False
     # A bar counts runs that have not stopped yet, too: they still occupy the place.
-    return all(draft.occupied(p) + claims.change.get(p, 0) < k for p, k in x.bars)
+    return not x.bars or all(draft.occupied(p) + claims.change.get(p, 0) < k for p, k in x.bars)
 
 
 def _fits(arc: ActionArc, run: Run) -> bool:

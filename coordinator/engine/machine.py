@@ -22,7 +22,7 @@ from petrobot.coordinator.engine.instructions import (
     Subject,
 )
 from petrobot.coordinator.engine.state import ACTIVE, LIVE, Mode, Phase, Run, State, Suspended
-from petrobot.coordinator.engine.step import Policy, abort, settle
+from petrobot.coordinator.engine.step import Policy, abort, lacking, settle
 from petrobot.coordinator.engine.stimuli import (
     Abort,
     AddTokens,
@@ -178,6 +178,11 @@ class Engine:
         waits for it, or its flag is kept until they do."""
         sets_flag = event in self.compiled.kept and event not in state.flags
         return sets_flag or awaited(Draft(self.compiled, state), event)
+
+    def lacking(self, state: State) -> dict[str, str]:
+        """Return the transitions that lack only tokens of one place for which they may compete,
+        each with that place."""
+        return lacking(Draft(self.compiled, state))
 
     def only_listens(self, state: State) -> bool:
         """Return whether only an event or the global memory can still change something but in

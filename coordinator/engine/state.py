@@ -15,6 +15,8 @@ from petrobot.coordinator.task.net import Marking
 class Mode(StrEnum):
     """How the engine treats stimuli."""
 
+    __hash__ = str.__hash__  # that of Enum is slow, and the engine looks members up all the time
+
     FRESH = "fresh"
     """Waits for `Begin`."""
     RUNNING = "running"
@@ -31,6 +33,8 @@ class Mode(StrEnum):
 
 class Phase(StrEnum):
     """Stage of a run."""
+
+    __hash__ = str.__hash__
 
     QUEUED = "queued"
     """Its token waits for a server, or for the operator to resume."""

@@ -117,16 +117,25 @@ def settle(
 
 def _note_waits(draft: Draft) -> None:
     """Note since when each transition that may compete for a token lacks nothing else."""
-    places, waits = draft.compiled.net.places, dict[str, Wait]()
+    waits = dict[str, Wait]()
+    for name, place in lacking(draft).items():
+        new = Wait(place, draft.stimuli)
+        old = draft.waits.get(name, new)
+        waits[name] = old if old.place == new.place else new
+    if waits != draft.waits:
+        draft.waits = waits
+
+
+def lacking(draft: Draft) -> dict[str, str]:
+    """Return the transitions that lack only tokens of one place for which they may compete, each
+    with that place."""
+    places, found = draft.compiled.net.places, dict[str, str]()
     for t, contested in draft.compiled.contested.items():
         x = draft.compiled.transitions[t]
         p = awaited_place(draft, x, contested)
         if p is not None:
-            new = Wait(places[p], draft.stimuli)
-            old = draft.waits.get(x.name, new)
-            waits[x.name] = old if old.place == new.place else new
-    if waits != draft.waits:
-        draft.waits = waits
+            found[x.name] = places[p]
+    return found
 
 
 def pause(draft: Draft, reason: str) -> None:
@@ -240,6 +249,8 @@ def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
 
 def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
     """Pause before a transition with a breakpoint, and keep its step. Return whether it paused."""
+    if not draft.breakpoints:
+        return False
     names = [m.transition.name for m in step]
     hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
     if not hit:
@@ -268,7 +279,7 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
     places = draft.compiled.net.places
     entered = [
         places[p]
-        for m in step
+        for m in (step if draft.breakpoints else ())
         for p, _, _ in m.transition.produce
         if places[p] in draft.breakpoints
     ]

@@ -17,6 +17,8 @@ Value = Any
 class Status(StrEnum):
     """How a run ended (paper, section 4)."""
 
+    __hash__ = str.__hash__  # that of Enum is slow
+
     SUCCESS = "success"
     FAILURE = "failure"
     ERROR = "error"

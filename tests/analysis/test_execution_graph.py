@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from petrobot.coordinator.analysis.execution.causes import explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
+from petrobot.coordinator.analysis.execution.names import Names
 from petrobot.coordinator.analysis.execution.progress import progress_of
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.time.measured import NoEstimate
@@ -330,6 +331,14 @@ class Path:
             at = there
 
 
+def keys_of(x: ExecutionGraph, names: Names) -> set[Hashable]:
+    """Return the states of a graph as other names tell them apart."""
+    return {
+        (names.key(state, orders), i in x.livelocks)
+        for i, (state, orders) in enumerate(zip(x.states, x.orders, strict=True))
+    }
+
+
 def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
     """Make the graph, follow random plays on it, replay its dead ends, and compare with what the
     engine reports."""
@@ -370,10 +379,12 @@ def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
         assert {t for step in served.steps for t in step.firings} == {
             t for step in x.steps for t in step.firings
         }
-        assert set(served.index) == {
-            (served.names.key(state, orders), i in x.livelocks)
-            for i, (state, orders) in enumerate(zip(x.states, x.orders, strict=True))
-        }
+        assert keys_of(served, served.names) == keys_of(x, served.names)
+        shared = execute(
+            task, limit=LIMIT, engine=engine, contests=free.contests, shared=free.shared
+        )
+        assert (shared.states, shared.orders) == (served.states, served.orders)
+        assert shared.steps == served.steps and np.array_equal(shared.target, served.target)
         if not free.contests:
             assert len(free) == len(served) and not path.undecided
 

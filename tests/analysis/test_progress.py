@@ -1009,6 +1009,45 @@ def test_a_path_tells_the_usual_reason() -> None:
     assert "reason 'other'" in errors[0] and "reason 'emergency_stop'" in errors[-1]
 
 
+KEPT = """
+schema = 1
+[task]
+name = "kept"
+final = "parts == 0 and arm == 1"
+final_error = "broken > 0"
+[primitive_tasks]
+work = { deadline = 1.0 }
+load = { deadline = 1.0 }
+wave = { deadline = 1.0 }
+[events]
+button = { memory = "latched", early = "keep" }
+[places]
+parts = { kind = "control", tokens = 1 }
+arm = { kind = "resource", tokens = 1 }
+broken = {}
+work = { kind = "action" }
+load = { kind = "action", holds = "arm" }
+ready = { tokens = 1, listen = true }
+wave = { kind = "action", holds = "arm", listen = true }
+[transitions]
+start = { in = ["parts"], out = ["work", "load"] }
+worked = { in = ["work:normal"] }
+failed = { in = ["work:error"], out = ["broken"] }
+loaded = { in = ["load:normal"] }
+spilled = { in = ["load:error"], out = ["broken"] }
+pressed = { in = ["ready"], out = ["wave"], event = "button" }
+waved = { in = ["wave:normal"], out = ["ready"] }
+tired = { in = ["wave:error"], out = ["ready"] }
+"""
+
+
+def test_an_event_that_is_served_after_an_error_does_not_stop_the_mission() -> None:
+    """`pressed` waits for the arm, which `spilled` gives back in the same step in which the mission
+    is lost."""
+    found = judged(loads(KEPT))
+    assert found.sound.holds, found.sound.reason
+
+
 def test_the_order_of_timers_is_kept() -> None:
     """The shorter of two timers that are armed together elapses first, so `late` never fires."""
     net: dict[str, dict[str, Any]] = {

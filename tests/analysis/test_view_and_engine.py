@@ -559,8 +559,36 @@ def test_figures_of_one_trial_stand_beside_those_of_the_mission() -> None:
     assert one.figures == alone.one_trial.figures == one.one_trial.figures
     assert one.conjunctive_reliability > found.forecast.conjunctive_reliability
     assert "forecast of a mission run of 3 trials:" in found.text()
-    assert f"one trial: P_complete 1.000000, R_goal {one.figures['R_goal']:.6f}" in found.text()
-    assert found.to_json(structure=False)["forecast"]["one_trial"] == one.figures
+    assert f"one trial: P_complete 1.000000, R_goal {one.told['R_goal']:.6f}" in found.text()
+    assert found.to_json(structure=False)["forecast"]["one_trial"] == one.told
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_r_goal_is_a_probability_although_a_trial_meets_several_goals(parts: int) -> None:
+    text = Text(parts, moves=[arcs("bad", "work:error", "arm")])
+    once = analyse(text.task(), view="gspn").forecast
+    found = analyse(replace(text.task(), goal_transitions=("start", "did")), view="gspn")
+    assert once is not None and found.forecast is not None and not found.doubts
+    assert once.goals is not None
+    assert once.goals == once.goal_reliability == pytest.approx(once.one_trial.told["R_goal"])
+    assert found.forecast.goals == pytest.approx(1 + once.goals)
+    assert found.forecast.goal_reliability == (pytest.approx(1.0) if parts == 1 else None)
+    assert found.forecast.one_trial.told["R_goal"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("taken", ["", "arm"])
+def test_it_is_told_that_a_branch_may_hold_a_trial_up(taken: str) -> None:
+    """`final` waits for the arm, but the time of a campaign's trial ends with `did`."""
+    text = Text(1, moves=[arcs("bad", "work:error", "arm")])
+    text.places.append('wave = { kind = "action", task = "wave", listen = true }\n')
+    text.places.append("ready = { tokens = 1, listen = true }\n")
+    back = ",".join(filter(None, ("ready", taken)))
+    text.moves.append(arcs("pressed", back, "wave", ', event = "button"'))
+    text.moves += [arcs(t, f"wave:{t}", back) for t in ("normal", "error")]
+    found = analyse(text.task(), view="gspn")
+    assert (
+        "in a campaign when its own tokens are back: pressed" in " ".join(found.text().split())
+    ) == bool(taken)
 
 
 def test_one_trial_begins_when_its_token_is_taken() -> None:

@@ -225,6 +225,7 @@ COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
             ["forecast", "catch_ball", "--estimates", "e", "--doubtful"],
             "--doubtful: nothing is registered without --out FILE",
         ),
+        (["serve", "tidy"], "expected no task, got 'tidy': choose it on the page"),
         ([*LOCKSTEP, "--page-port", "8000"], "--page-port: a run in lock step serves no page"),
         (["show", "catch_ball", "--graph", "--errors"], "--errors: the reachability graph has"),
         (

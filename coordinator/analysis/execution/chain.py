@@ -133,8 +133,8 @@ class ExecutionChain:
 
     @cached_property
     def figures(self) -> dict[str, float]:
-        """P_complete, R_goal (if the task names goals and a runs place), R_conj and the mean time
-        to completion (s; nan if it never completes), as `time.task_forecast` defines them."""
+        """P_complete, goals per run (if the task names goals and a runs place), R_conj and the mean
+        time to completion (s; nan if it never completes), as `time.task_forecast` defines them."""
         x, task = self.x, self.x.engine.compiled.task
         h, y = self._reach(x.final)
         found = {"P_complete": float(h[0])}
@@ -143,7 +143,7 @@ class ExecutionChain:
             met = np.append(np.array([*goals, 0])[x.label], 0)[self.edge]  # edge -1: none
             first = sum(f in task.goal_transitions for f in x.first)
             runs = task.net.initial[task.net.place_index[task.runs_place]]
-            found |= {"R_goal": (first + float(self.taken @ met)) / runs} if runs else {}
+            found |= {"goals per run": (first + float(self.taken @ met)) / runs} if runs else {}
         found["R_conj"] = float(self._arrival(x.final, ~self.spoils)[3][0])
         return found | {"mean time (s)": float(y[0] / h[0]) if h[0] else float("nan")}
 
@@ -404,7 +404,7 @@ class _Builder:
         samples = {"P_complete": [float(final) for final, *_ in ended]}
         if task.goal_transitions and task.runs_place:
             runs = task.net.initial[task.net.place_index[task.runs_place]]
-            samples |= {"R_goal": [met / runs for _, _, met, _ in ended]} if runs else {}
+            samples |= {"goals per run": [met / runs for _, _, met, _ in ended]} if runs else {}
         samples["R_conj"] = [float(final and not spoilt) for final, _, _, spoilt in ended]
         samples["mean time (s)"] = [time for final, time, *_ in ended if final]
         return MissionFigures(len(ended), {name: _mean(some) for name, some in samples.items()})

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.engine import (
     Begin,
+    Choose,
     Engine,
     EventOccurred,
     Fired,
@@ -57,7 +59,8 @@ QUEUE = 16
 """So many runs of a state count like one more firing. Else a queue that a timer fills for ever
 reaches thousands of runs, and each stimulus takes as long."""
 
-
+TIMELESS, UNSAFE = "timeless", "unsafe"
+"""Keys of reports: transitions fire for ever, a place with one server gets a second token."""
 TOLD_FIRST, TOLD_LAST = 5, 10
 """Steps of a long path that a text names."""
 
@@ -133,6 +136,7 @@ class ExecutionGraph:
     """By conflict that neither priority nor weight decides: a state in which it occurs."""
     index: Mapping[Hashable, int] = field(repr=False)
     """Number of each state, by the parts of it on which the future depends."""
+    shared: Shared = field(repr=False)
     by_hand: Mask
     """Which edges are commands of the operator; only `with_operator` adds them."""
 
@@ -238,7 +242,8 @@ class ExecutionGraph:
         before = self.states[state]
         after, said = self.engine.handle(before, cause.stimulus)
         orders = self.names.next_orders(before, self.orders[state], after)
-        number = self.index[self.names.key(after, orders), _endless(said)]
+        core = self.shared.number(self.names.core(after, orders), after)
+        number = self.index[core, *self.names.rest(after), _reports(said, TIMELESS)]
         step = self._numbers.get(Step(cause.text, _fired(said), cause.stimulus), -1)
         return after, said, number, self._edges.get((state, number, step), -1)
 
@@ -261,6 +266,43 @@ class ExecutionGraph:
         return {p: n for p, n in zip(places, self.states[state].marking, strict=True) if n}
 
 
+class NextState(NamedTuple):
+    """What follows a state by one stimulus."""
+
+    number: int
+    """That of the next state, in `Shared`."""
+    firings: tuple[str, ...]
+    more: int
+    """Runs that came to those still to do."""
+
+
+class Shared:
+    """What searches of one task find out for each other. Here states have the same number if they
+    differ only in who has waited longer, or in how many runs are still to do, as long as there are
+    some (`Names.core`)."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[Hashable, int] = {}
+        self._examples: list[State] = []
+        self._lacking: dict[int, Mapping[str, str]] = {}
+        self.after: dict[int, list[NextState | None]] = {}
+        """By state and stimulus, in the order of `Names.stimuli`: what follows; None where it may
+        depend on what differs."""
+
+    def number(self, core: Hashable, state: State) -> int:
+        """Return the number of a state with this core."""
+        found = self._numbers.setdefault(core, len(self._examples))
+        if found == len(self._examples):
+            self._examples.append(state)
+        return found
+
+    def lacking(self, number: int, engine: Engine) -> Mapping[str, str]:
+        """Return `Engine.lacking` of the states with a number."""
+        if number not in self._lacking:
+            self._lacking[number] = engine.lacking(self._examples[number])
+        return self._lacking[number]
+
+
 def execute(
     task: Task,
     *,
@@ -268,15 +310,17 @@ def execute(
     free_choice: bool = False,
     engine: Engine | None = None,
     contests: Iterable[tuple[str, ...]] | None = None,
+    shared: Shared | None = None,
 ) -> ExecutionGraph:
     """Explore the execution graph of a task, up to a limit in stimuli and firings.
 
     With `free_choice`, any transition may win a conflict that neither priority nor weight decides.
     `contests` are the transitions of each such conflict, if they are known; then only their order
-    of waiting distinguishes states. Raises TooManyValues.
+    of waiting distinguishes states. `shared`: what searches of this task have found before, also
+    with other numbers of runs. Raises TooManyValues.
     """
     engine = engine or Engine(task, policy=Policy(ask_undecided=free_choice))
-    return _Search(engine, Names(engine, contests)).run(limit)
+    return _Search(engine, Names(engine, contests), shared or Shared()).run(limit)
 
 
 def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
@@ -290,11 +334,13 @@ def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
     search = _Search(
         x.engine,
         x.names,
+        x.shared,
         dict(x.index),
         list(x.states),
         list(x.orders),
         list(x.came),
-        {step: i for i, step in enumerate(x.steps)},
+        list(x.steps),
+        {(step.text, step.firings): i for i, step in enumerate(x.steps)},
         list(x.livelocks),
         dict(x.crowded),
         dict(x.contests),
@@ -307,11 +353,15 @@ def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
 class _Search:
     engine: Engine
     names: Names
+    shared: Shared
     index: dict[Hashable, int] = field(default_factory=dict)
+    """By number in `shared`, `Names.rest`, and whether it fires for ever."""
     states: list[State] = field(default_factory=list)
     orders: list[Orders] = field(default_factory=list)
     came: list[tuple[int, Stimulus] | None] = field(default_factory=list)
-    steps: dict[Step, int] = field(default_factory=dict)
+    steps: list[Step] = field(default_factory=list)
+    labels: dict[tuple[str, tuple[str, ...]], int] = field(default_factory=dict)
+    """By text and firings: number of the step."""
     livelocks: list[int] = field(default_factory=list)
     crowded: dict[str, int] = field(default_factory=dict)
     contests: dict[tuple[str, ...], int] = field(default_factory=dict)
@@ -340,7 +390,7 @@ class _Search:
             for i in range(begin, end):
                 if self.handled >= limit:
                     break
-                self._follow(i, self.names.commands(self.states[i]))
+                self._follow(i, self.names.commands(self.states[i]), None)
             by_hand += [True] * (len(self.edges[0]) - len(by_hand))
             begin, end = end, self._explore(end, limit)
             by_hand += [False] * (len(self.edges[0]) - len(by_hand))
@@ -354,25 +404,68 @@ class _Search:
         explored."""
         looked = self.handled
         while i < len(self.states) and self.handled < limit and not self.late:
-            self._follow(i, self._causes(i))
+            state = self.states[i]
+            number = self.shared.number(self.names.core(state, self.orders[i]), state)
+            self._follow(i, self._causes(i), self.shared.after.setdefault(number, []))
             i += 1
             if self.handled - looked >= BETWEEN:
                 looked, self.late = self.handled, overtime()
         return i
 
-    def _follow(self, i: int, causes: Iterable[Cause]) -> None:
+    def _follow(
+        self, i: int, causes: Iterable[Cause], known: list[NextState | None] | None
+    ) -> None:
+        """Follow stimuli from a state. `known` is what followed each of them in states that share
+        their number with this one, and is extended; None: the stimuli are not those of the world.
+        """
         source, target, label = self.edges
-        for cause in causes:
-            before = self.states[i]
-            state, said = self.engine.handle(before, cause.stimulus)
-            j = self._found(before, self.orders[i], state, said, (i, cause.stimulus))
-            step = Step(cause.text, _fired(said), cause.stimulus)
-            runs = sum(map(len, state.tokens.values()))
-            self.handled += 1 + len(step.firings) + runs // QUEUE
-            if i != j or step.firings:
+        before = self.states[i]
+        for n, cause in enumerate(causes):
+            found = known[n] if known is not None and n < len(known) else None
+            j = None if found is None else self._known(before, found)
+            if found is not None and j is not None:
+                firings = found.firings
+            else:
+                state, said = self.engine.handle(before, cause.stimulus)
+                came = (i, cause.stimulus)
+                j, core, firings = self._found(before, self.orders[i], state, said, came)
+                if known is not None and n == len(known) and self.engine.policy.ask_undecided:
+                    known.append(self._next(before, state, said, core, firings))
+            runs = sum(map(len, self.states[j].tokens.values()))
+            self.handled += 1 + len(firings) + runs // QUEUE
+            if i != j or firings:
+                number = self.labels.setdefault((cause.text, firings), len(self.steps))
+                if number == len(self.steps):
+                    self.steps.append(Step(cause.text, firings, cause.stimulus))
                 source.append(i)
                 target.append(j)
-                label.append(self.steps.setdefault(step, len(self.steps)))
+                label.append(number)
+
+    def _next(
+        self,
+        before: State,
+        state: State,
+        said: tuple[Instruction, ...],
+        core: int,
+        firings: tuple[str, ...],
+    ) -> NextState | None:
+        """Return what follows in all states that share their number with `before`; None if it may
+        depend on the rest of them."""
+        draws = state.suspended is not None  # in some of them nobody asks: first come, first served
+        if state.mode is not Mode.RUNNING or draws or _reports(said, UNSAFE):
+            return None
+        if self.names.begins.intersection(firings):
+            return None
+        return NextState(core, firings, self.names.left(state) - self.names.left(before))
+
+    def _known(self, before: State, found: NextState) -> int | None:
+        """Return the number of the state that follows, if it was found before."""
+        left = self.names.left(before) + found.more
+        waiting: Hashable = ()
+        if not self.engine.policy.ask_undecided:
+            lacking = self.shared.lacking(found.number, self.engine)
+            waiting = self.names.waiting_after(before, lacking, found.firings)
+        return self.index.get((found.number, waiting, left, False))
 
     def _result(
         self, first: tuple[str, ...], expanded: int, by_hand: Mask, limit: int
@@ -402,6 +495,7 @@ class _Search:
             self.crowded,
             self.contests,
             self.index,
+            self.shared,
             by_hand[order],
         )
 
@@ -415,11 +509,12 @@ class _Search:
         state: State,
         said: tuple[Instruction, ...],
         came: tuple[int, Stimulus] | None,
-    ) -> int:
+    ) -> tuple[int, int, tuple[str, ...]]:
+        """Return the number of the state, its number in `shared`, and what fired on the way."""
         after = self.names.next_orders(before, orders, state)
-        reports = [i for i in said if isinstance(i, Report)]
-        endless = _endless(said)
-        key = (self.names.key(state, after), endless)
+        core = self.shared.number(self.names.core(state, after), state)
+        endless = _reports(said, TIMELESS)
+        key = (core, *self.names.rest(state), endless)
         number = self.index.setdefault(key, len(self.states))
         if number == len(self.states):
             self.states.append(state)
@@ -427,21 +522,20 @@ class _Search:
             self.came.append(came)
             if endless:
                 self.livelocks.append(number)
-        for report in reports:
-            if report.key == "unsafe":
-                self.crowded.setdefault(report.of, number)
-        for instruction in said:
-            if rivals := self.names.undecided(instruction):
+        for one in said:
+            if isinstance(one, Report) and one.key == UNSAFE:
+                self.crowded.setdefault(one.of, number)
+            elif isinstance(one, Choose) and (rivals := self.names.undecided(one)):
                 self.contests.setdefault(rivals, number)
-        return number
+        return number, core, _fired(said)
 
 
 def _fired(said: tuple[Instruction, ...]) -> tuple[str, ...]:
     return tuple(i.transition for i in said if isinstance(i, Fired))
 
 
-def _endless(said: tuple[Instruction, ...]) -> bool:
-    return any(isinstance(i, Report) and i.key == "timeless" for i in said)
+def _reports(said: tuple[Instruction, ...], key: str) -> bool:
+    return any(isinstance(i, Report) and i.key == key for i in said)
 
 
 __all__ = ["MOVES", "STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]

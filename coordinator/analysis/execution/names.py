@@ -32,11 +32,12 @@ from petrobot.coordinator.engine import (
     TimerFired,
     VariableChanged,
 )
-from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.engine.state import ACTIVE, Wait
 from petrobot.coordinator.task import End, Executed, Kind, Scope, Status, Task
 from petrobot.coordinator.task.conditions import Compare, Literal, Name, walk
 from petrobot.coordinator.task.conditions.language import as_literal, equal, is_number, with_values
 from petrobot.coordinator.task.conditions.regions import region_values
+from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.validation import is_pulse
 
 RUN_FIELDS = ("status", "reason", "executed")
@@ -114,7 +115,16 @@ class Names:
             }
             for place in compiled.action_places
         }
+        self._causes: dict[tuple[str, str], list[Cause]] = {}
+        """By run and its name in words: its ends."""
         self.ends = {place: self._ends_of(place) for place in compiled.action_places}
+        self._counter = self._uncounted()
+        """The place of the runs still to do, if a state's future is the same for any number of them
+        until a run begins."""
+        self.begins = frozenset(
+            x.name for x in compiled.transitions if self._counter in dict(x.plain)
+        )
+        """The transition by which a run begins then."""
         self.assumptions = tuple(
             [f"{name} may take any value at any time" for name in self.free]
             + [
@@ -125,58 +135,101 @@ class Names:
         )
         """Assumptions of the verdicts, as clauses."""
 
+    def _uncounted(self) -> int | None:
+        compiled = self.engine.compiled
+        net, task = compiled.net, compiled.task
+        p = net.place_index.get(task.runs_place)
+        takers = [dict(x.needs)[p] for x in compiled.transitions if p in dict(x.needs)]
+        barred = any(p in dict(x.bars) for x in compiled.transitions)
+        ends = [c for c in (task.final, task.final_error) if c is not None]
+        literals, together = _compared(ends)
+        asked = literals.get(task.runs_place, [])
+        few = takers == [1] and not barred and set(asked) <= {0} and task.runs_place not in together
+        return p if few else None
+
     # --- which states are equal --------------------------------------------------------------
 
     def key(self, state: State, orders: Orders) -> Hashable:
         """Return what the future of the state depends on."""
+        return self.core(state, orders), *self.rest(state)
+
+    def core(self, state: State, orders: Orders) -> Hashable:
+        """Return what the future of the state depends on, without `rest`."""
         if state.mode is Mode.FINISHED:
             return (state.mode, state.marking)
         runs, at, waiting = list[Hashable](), dict[str, tuple[str, int]](), list[Run]()
-        for place in self.engine.compiled.action_places:
-            present = state.tokens.get(place, ())
+        for place, present in state.tokens.items():
             if not present:
-                runs.append(())
                 continue
             if len(present) > 1 and place not in self._mixed:
                 present = tuple(
                     sorted(present, key=lambda r: r.ended if r.phase is Phase.DONE else 0)
                 )
             ends = sorted([r.ended for r in present if r.phase is Phase.DONE])
-            runs.append(tuple([self._run(run, ends) for run in present]))
+            runs.append((place, *[self._run(run, ends) for run in present]))
             for i, run in enumerate(present):
                 at[run.id] = (place, i)
                 if run.phase is Phase.WAITING:
                     waiting.append(run)
-        stopping = sorted([(r.place, r.phase.value, r.device) for r in state.stopping.values()])
+        stopping = sorted([(r.place, r.phase, r.device) for r in state.stopping.values()])
         timers = sorted(
-            (name, timer.elapsed, tuple(at[i] for i in timer.runs))
-            for name, timer in state.timers.items()
+            [
+                (name, timer.elapsed, tuple([at[i] for i in timer.runs]))
+                for name, timer in state.timers.items()
+            ]
         )
         draw = state.suspended
         return (
             state.mode,
-            self._waiting(state),
             state.closing,
-            state.marking,
-            tuple(runs),
+            self._counted(state.marking),
+            frozenset(runs),
             tuple(stopping),
-            tuple(r.place for r in sorted(waiting, key=lambda r: r.order)),
-            state.flags.intersection(self.engine.compiled.waiting),
+            tuple([r.place for r in sorted(waiting, key=lambda r: r.order)]) if waiting else (),
+            state.flags and state.flags.intersection(self.engine.compiled.waiting),
             tuple(timers),
             orders,
             None if draw is None else (draw.pulse, draw.choices, draw.alternatives, draw.only),
             tuple([self.region(n, state.variables.get(n, MISSING)) for n in self._in_order]),
         )
 
-    def _waiting(self, state: State) -> Hashable:
+    def rest(self, state: State) -> tuple[Hashable, int]:
+        """Return the order of waiting, and how many runs are still to do."""
+        waits = {} if state.mode is Mode.FINISHED else state.waits
+        return self.order_of(waits), self.left(state)
+
+    def left(self, state: State) -> int:
+        """Return how many runs are still to do; 0 if `core` says it."""
+        return 0 if self._counter is None else state.marking[self._counter]
+
+    def waiting_after(
+        self, before: State, lacking: Mapping[str, str], firings: Iterable[str]
+    ) -> Hashable:
+        """Return the order of waiting in a state after `before` and these firings, in which each
+        transition of `lacking` lacks only tokens of that place."""
+        waits = dict[str, Wait]()
+        for name, place in lacking.items():
+            old = before.waits.get(name)
+            stays = old is not None and old.place == place and name not in firings
+            waits[name] = old if old and stays else Wait(place, before.stimuli + 1)
+        return self.order_of(waits)
+
+    def _counted(self, marking: Marking) -> Marking:
+        """Return the marking; of the runs still to do only whether there are any."""
+        if (p := self._counter) is None or marking[p] < 2:
+            return marking
+        return (*marking[:p], 1, *marking[p + 1 :])
+
+    def order_of(self, waits: Mapping[str, Wait]) -> Hashable:
         """Return what each waiting transition waits for, and which of two has waited longer if they
         may compete. No other order matters."""
-        waits = state.waits
         if not waits or self._contests == frozenset():
             return ()
-        groups = [tuple(waits)] if self._contests is None else self._contests
+        if self._contests is None:
+            ranks = {s: i for i, s in enumerate(sorted({w.since for w in waits.values()}))}
+            return frozenset([(name, w.place, ranks[w.since]) for name, w in waits.items()])
         known, older = set[tuple[str, str]](), set[tuple[str, str]]()
-        for group in groups:
+        for group in self._contests:
             present = [name for name in group if name in waits]
             known.update((name, waits[name].place) for name in present)
             older.update(
@@ -185,9 +238,9 @@ class Names:
         return frozenset(known), frozenset(older)
 
     def _run(self, run: Run, ends: list[int]) -> Hashable:
-        raised = run.raised & self._waits[run.place]
+        raised = run.raised & self._waits[run.place] if run.raised else run.raised
         if run.phase is not Phase.DONE:
-            phase = "active" if run.phase in ACTIVE else run.phase.value
+            phase = "active" if run.phase in ACTIVE else run.phase
             return (phase, run.device if run.phase is not Phase.QUEUED else "", raised)
         status = run.status
         if run.place not in self.asked["status"] and status is Status.FAILURE:
@@ -268,14 +321,19 @@ class Names:
                     known.add(device)
                     yield Cause(Chosen(run.id, action), f"{name} starts")
         elif run.phase in ACTIVE:
-            for end, text in self.ends[run.place]:
-                yield Cause(replace(end, run=run.id), f"{name} ends in {text}")
+            if (run.id, name) not in self._causes:
+                self._causes[run.id, name] = [
+                    Cause(replace(end, run=run.id), f"{name} ends in {text}")
+                    for end, text in self.ends[run.place]
+                ]
+            yield from self._causes[run.id, name]
             for event in sorted(self._waits[run.place] - run.raised):
                 yield Cause(RunRaised(run.id, event), f"{name} raises {event}")
 
     def _stops(self, state: State) -> Iterator[Cause]:
         seen = set[Hashable]()
-        for run in state.stopping.values():
+        # Equal states yield their stimuli in the same order, so they are not in order of their ids.
+        for run in sorted(state.stopping.values(), key=lambda r: (r.place, r.device)):
             if run.phase is Phase.STOPPING and (run.place, run.device) not in seen:
                 seen.add((run.place, run.device))
                 yield Cause(StopConfirmed(run.id), f"{run.place} has stopped")

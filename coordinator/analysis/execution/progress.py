@@ -39,6 +39,7 @@ from petrobot.coordinator.analysis.execution.causes import (
 from petrobot.coordinator.analysis.execution.chain import ExecutionChain, TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import (
     ExecutionGraph,
+    Shared,
     Step,
     execute,
     with_operator,
@@ -338,7 +339,8 @@ class Progress:
         marks, found, free = self._marks(awaiting), set[str](), (self._nominal & can)[x.source]
         for n in np.unique(x.label[free]).tolist():
             found |= marks.intersection(x.steps[n].firings)
-        for n in np.unique(x.label[free & ~can[x.target]]).tolist():
+        # After a run that ended in ERROR, an event that was kept may be served in the same step.
+        for n in np.unique(x.label[free & ~x.fails & ~can[x.target]]).tolist():
             cause = x.steps[n].stimulus
             came = cause.event if isinstance(cause, EventOccurred) else None
             fired = x.steps[n].firings
@@ -948,20 +950,21 @@ def progress_of(
     limit: int,
     measured: Measured | None = None,
     devices: Mapping[str, str] | None = None,
+    shared: Shared | None = None,
 ) -> Progress:
     """Return the verdicts on the execution graph of a task, within a limit in stimuli
-    and firings.
+    and firings. `shared` is for all calls with the same task and other numbers of runs.
 
     `devices` gives the device of each action that has one: two runs never use it at a time.
     Raises TooManyValues.
     """
-    asking = Engine(view.task, devices, Policy(ask_undecided=True))
-    free = execute(view.task, limit=limit, engine=asking)
+    asking, shared = Engine(view.task, devices, Policy(ask_undecided=True)), shared or Shared()
+    free = execute(view.task, limit=limit, engine=asking, shared=shared)
     if not free.contests:
         return Progress(free, view, measured)
     contests = free.contests if free.complete else None
     engine = Engine(view.task, devices)
-    served = execute(view.task, limit=limit, engine=engine, contests=contests)
+    served = execute(view.task, limit=limit, engine=engine, contests=contests, shared=shared)
     return Progress(served, view, measured, Progress(free, view))
 
 

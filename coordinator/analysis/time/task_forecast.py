@@ -1,7 +1,8 @@
 """The forecast of a task: three reliabilities, times, firings, and what is worth improving.
 
 - P_complete: probability that `final` is reached.
-- R_goal: expected number of met goals per run token.
+- R_goal: probability that a trial meets its goal at least once. For several trials in a mission run
+  it is the mean number of met goals for each run token, unless one token can meet several.
 - R_conj: probability that the task completes and every run ends with SUCCESS.
 
 P_complete, R_conj and times are those of a whole mission run, with all its run tokens; campaigns
@@ -38,11 +39,17 @@ from petrobot.coordinator.analysis.time.gspn import Chain, Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.stochastic import StochasticView
-from petrobot.coordinator.task import Status
+from petrobot.coordinator.task import Kind, Status
 from petrobot.coordinator.task.net import Marking
+from petrobot.coordinator.task.wording import few
 
+SAME = 1e-9
+"""Figures that differ by less are the same."""
 MATTERS = 0.01
 """Share of the time of a mission run, or of a figure, above which an error of a fit is reported."""
+GOALS = "goals per run"
+"""Name of the mean number of met goals for each run token among the figures. It is R_goal, unless
+one token can meet several goals."""
 TIME = "mean time (s)"
 """Name of the mean time to completion among the figures."""
 
@@ -89,12 +96,46 @@ class Forecast:
         return trial_forecast(self.view) if self.view.task.runs_place else self
 
     @property
+    def later(self) -> tuple[str, ...]:
+        """Why the time of one trial is longer here than in a campaign; empty if it is not."""
+        flat, own = self.view.task.flat, {self.view.task.runs_place}
+        resources = {p.name for p in flat.places.values() if p.kind is Kind.RESOURCE}
+        moves = [
+            ({a.place for a in t.inputs}, {o.place for o in t.outputs} - resources, t)
+            for t in flat.transitions.values()
+        ]
+        while more := {p for taken, given, _ in moves if taken & own for p in given} - own:
+            own |= more
+        names = [
+            t.name
+            for taken, _, t in moves
+            if t.events and taken.isdisjoint(own) and taken & (resources | flat.final.names)
+        ]
+        if not names or not self.view.task.runs_place:
+            return ()
+        text = "a trial ends here with `final`, in a campaign when its own tokens are back"
+        return (f"{text}: {few(names)} may keep what `final` asks for",)
+
+    @property
     def figures(self) -> dict[str, float]:
-        """P_complete, R_goal (if it is defined), R_conj and the mean time to completion (s)."""
+        """What another model must have, too: P_complete, the goals for each run (if they are
+        defined), R_conj and the mean time to completion (s)."""
+        return {
+            "P_complete": self.completion_probability,
+            **({} if self.goals is None else {GOALS: self.goals}),
+            "R_conj": self.conjunctive_reliability,
+            TIME: self.done.mean,
+        }
+
+    @property
+    def told(self) -> dict[str, float]:
+        """The figures for people: R_goal, where it is defined, and the mean number of goals only
+        where that is another figure."""
         goal = self.goal_reliability
         return {
             "P_complete": self.completion_probability,
             **({} if goal is None else {"R_goal": goal}),
+            **({} if self.goals is None or goal == self.goals else {GOALS: self.goals}),
             "R_conj": self.conjunctive_reliability,
             TIME: self.done.mean,
         }
@@ -201,25 +242,47 @@ class Forecast:
 
     @cached_property
     def goal_reliability(self) -> float | None:
-        """R_goal: expected met goals per run token; None if the task names no goal transitions or
-        no runs place."""
-        task = self.view.task
-        if not task.goal_transitions or not task.runs_place:
+        """R_goal; None if the task names no goal transitions or no runs place, or if one of several
+        run tokens can meet several goals: then no state says which of them has met one."""
+        goals, alone = self.goals, self if self.trials == 1 else self.one_trial
+        if goals is None or alone.goals is None:
             return None
-        runs = self.chain.gspn.net.initial[self.chain.gspn.net.place_index[task.runs_place]]
-        return sum(self.firings[name] for name in task.goal_transitions) / runs if runs else None
+        once = alone._meets_goal
+        if abs(alone.goals - once) <= SAME:  # solved in two ways, the same figure has other digits
+            return goals
+        return once if self.trials == 1 else None
+
+    @cached_property
+    def goals(self) -> float | None:
+        """Mean number of met goals for each run token; None if the task names no goal transitions
+        or no runs place."""
+        task = self.view.task
+        if not task.goal_transitions or not task.runs_place or not self.trials:
+            return None
+        return sum(self.firings[name] for name in task.goal_transitions) / self.trials
+
+    @property
+    def _meets_goal(self) -> float:
+        """Probability that a goal is met at least once."""
+        goals, origin = self.view.task.goal_transitions, self.view.origin
+        meets = np.array([origin.get(n) in goals for n in self.chain.gspn.net.transitions])
+        return self._reaches(meets[self.chain.label], ~meets[self.chain.label])
 
     @cached_property
     def conjunctive_reliability(self) -> float:
         """R_conj: probability of completing while every run ends with SUCCESS."""
         index = self.chain.gspn.net.transition_index
         spoilt = np.isin(self.chain.label, [index[name] for name in self.view.spoils])
-        open_ = self.transient[self.chain.source] & ~spoilt
-        value = np.where(open_ & self.transient[self.chain.target], self.chain.probability, 0.0)
-        direct = open_ & self.done.goal[self.chain.target]
+        clean = self._reaches(self.done.goal[self.chain.target] & ~spoilt, ~spoilt)
+        return 1.0 if self.done.goal[0] else clean
+
+    def _reaches(self, last: Mask, before: Mask) -> float:
+        """Return the probability of taking one of the `last` edges, after edges in `before`."""
+        open_ = self.transient[self.chain.source]
+        inside = open_ & before & self.transient[self.chain.target]
+        value, direct = np.where(inside, self.chain.probability, 0.0), open_ & last
         arrive = sum_by(self.chain.source[direct], self.chain.probability[direct], self.chain.n)
-        clean = solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)
-        return 1.0 if self.done.goal[0] else float(clean[0])
+        return float(solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)[0])
 
     @cached_property
     def worth(self) -> tuple[Worth, ...]:
@@ -324,12 +387,13 @@ class Forecast:
             "P_complete": self.completion_probability,
             "P_complete_error": self.completion_error,
             "R_goal": self.goal_reliability,
+            "goals_per_run": self.goals,
             "R_conj": self.conjunctive_reliability,
             "mean": self.done.mean,
             "standard_deviation": self.done.variance**0.5,
             "quantiles": {f"{q:g}": shape.quantile(q) for q in quantiles} if shape else {},
             "trials": self.trials,
-            "one_trial": self.one_trial.figures,
+            "one_trial": self.one_trial.told,
             "mission_time": self.mission_time,
             "recovery_time": self.recovery_time,
             "firings": self.firings,

@@ -175,6 +175,7 @@ def exact(
         **{k: None if v is None else float(f"{v:.7g}") for k, v in numbers.items()},
         "P_complete_interval": _share_error(task, estimates, context, found),
         "markings": found.chain.n,
+        "notes": list(found.later),
     }
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from petrobot.coordinator.studies.forecast.predict import TRIALS
 from petrobot.coordinator.studies.forecast.residual import NEGLIGIBLE
+from petrobot.coordinator.task.wording import wrapped
 
 WORDS = {
     "R_goal": "R_goal",
@@ -58,8 +59,9 @@ def forecast_text(made: Mapping[str, Any]) -> str:
         lines.append(f"    simulated net: {said['contexts']} contexts; {_worst(said)}")
         if 0.0005 < said["endless"] <= NEGLIGIBLE:
             lines.append(f"    note: {said['endless']:.1%} of the simulated trials never end")
-        lines += [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
-        lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
+        told = [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
+        told += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
+        lines += [wrapped(line, 8) for line in told]
     if "assumed" in made and any("gspn" in said for said in made["regimes"].values()):
         lines.append(
             f"  measured trials include waits for devices; the simulated net and the exact "
@@ -88,7 +90,7 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
             f"      its P_complete: 95 % {_bounds(gspn['P_complete_interval'])} from the measured "
             f"shares; relative error of the solution {gspn['P_complete_error']:.0e}"
         )
-    return lines
+    return [*lines, *(wrapped(f"      {note}", 8) for note in gspn.get("notes", ()))]
 
 
 def _worst(said: Mapping[str, Any]) -> str:
