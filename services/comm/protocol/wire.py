@@ -297,7 +297,8 @@ class Connection:
         assert self._seal_out is not None
         length = len(body) + self._seal_bytes
         end = self._seal_out.next(body) if self._keys else _PACK_CHECK(crc32(body))
-        return length.to_bytes(_HEADER, "big") + body + end
+        # Two sums would copy the body twice.
+        return b"".join((length.to_bytes(_HEADER, "big"), body, end))
 
     def _opening_refusal(self, body: bytes) -> bytes:
         # Once the key is proved, the refusal carries the seal that the first frame of the open
