@@ -44,6 +44,8 @@ from tools.bench.wire_contenders import (
 from tools.bench.wire_peers import CONTENDERS
 from tools.bench.wire_streams import measure_streams
 
+from petrobot.services.host.parent_death import die_with
+
 IN_FLIGHT = 64
 LEAST = 50
 """Fewest calls of each task in flight when calls per second are measured, so that the start has no
@@ -274,6 +276,7 @@ def run(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _be_one_end(arguments: argparse.Namespace) -> None:
+    die_with(os.getppid())  # also where the bench ends before it has started all contenders
     name, *port = [arguments.serve] if arguments.serve else arguments.ask
     contender = next(one for one in CONTENDERS if one.name == name)()
     if arguments.pin:
