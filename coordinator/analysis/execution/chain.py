@@ -40,6 +40,7 @@ from petrobot.coordinator.analysis.time.measured import (
     is_cause,
 )
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
+from petrobot.coordinator.analysis.time.task_forecast import GOALS, TIME
 from petrobot.coordinator.engine import (
     CancelRun,
     Chosen,
@@ -143,9 +144,9 @@ class ExecutionChain:
             met = np.append(np.array([*goals, 0])[x.label], 0)[self.edge]  # edge -1: none
             first = sum(f in task.goal_transitions for f in x.first)
             runs = task.net.initial[task.net.place_index[task.runs_place]]
-            found |= {"goals per run": (first + float(self.taken @ met)) / runs} if runs else {}
+            found |= {GOALS: (first + float(self.taken @ met)) / runs} if runs else {}
         found["R_conj"] = float(self._arrival(x.final, ~self.spoils)[3][0])
-        return found | {"mean time (s)": float(y[0] / h[0]) if h[0] else float("nan")}
+        return found | {TIME: float(y[0] / h[0]) if h[0] else float("nan")}
 
     @property
     def taken(self) -> Values:
@@ -404,9 +405,9 @@ class _Builder:
         samples = {"P_complete": [float(final) for final, *_ in ended]}
         if task.goal_transitions and task.runs_place:
             runs = task.net.initial[task.net.place_index[task.runs_place]]
-            samples |= {"goals per run": [met / runs for _, _, met, _ in ended]} if runs else {}
+            samples |= {GOALS: [met / runs for _, _, met, _ in ended]} if runs else {}
         samples["R_conj"] = [float(final and not spoilt) for final, _, _, spoilt in ended]
-        samples["mean time (s)"] = [time for final, time, *_ in ended if final]
+        samples[TIME] = [time for final, time, *_ in ended if final]
         return MissionFigures(len(ended), {name: _mean(some) for name, some in samples.items()})
 
     def mission(

@@ -52,13 +52,12 @@ STEPS = 300_000
 """The most stimuli and firings for one graph; they take about twenty seconds."""
 MOVES = 3
 """The most commands of the operator on a path of `with_operator`. A token that he adds can be used
-up and added again, so without this nearly every search would go on to its limit."""
+up and added again, so without this nearly every search would reach its limit."""
 BETWEEN = 1_000
 """Stimuli and firings between two looks at the clock."""
 QUEUE = 16
 """So many runs of a state count like one more firing. Else a queue that a timer fills for ever
 reaches thousands of runs, and each stimulus takes as long."""
-
 TIMELESS, UNSAFE = "timeless", "unsafe"
 """Keys of reports: transitions fire for ever, a place with one server gets a second token."""
 TOLD_FIRST, TOLD_LAST = 5, 10
@@ -451,7 +450,7 @@ class _Search:
     ) -> NextState | None:
         """Return what follows in all states that share their number with `before`; None if it may
         depend on the rest of them."""
-        draws = state.suspended is not None  # in some of them nobody asks: first come, first served
+        draws = state.suspended is not None  # in others the order of waiting may decide, unasked
         if state.mode is not Mode.RUNNING or draws or _reports(said, UNSAFE):
             return None
         if self.names.begins.intersection(firings):
