@@ -360,7 +360,8 @@ class Worker:
                 self._advance(monotonic())
             if self._calls:
                 self._give_back()
-            if not self._place.runs:
+            if self._used and not self._place.runs:
+                os.sched_yield()  # first let the node read the report
                 self._restore()  # now, so that the next call need not wait for it
             if self._changed and not self._node.unsent:
                 os._exit(CHANGED)
