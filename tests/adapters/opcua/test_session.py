@@ -125,8 +125,7 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
     assert driver.stopped() and driver.state()["faults"] == {}
     written = {"count": 7, "speed": 2, "sensor": True, "manner": "silent", "level": 3}
     assert done(driver, written) == ""
-    state = await_(driver, lambda state: state["values"]["manner"] == "silent", "the values")
-    assert state["values"] | written == state["values"]
+    state = await_(driver, lambda s: s["values"] | written == s["values"], "the values")
     # a value that does not fit its node is refused by name and type; the session continues
     assert "count: expected Int16" in done(driver, {"count": 70000})
     assert "count: expected Int16" in done(driver, {"count": "seven"})
@@ -233,7 +232,7 @@ def test_a_stop_that_a_frozen_server_has_not_taken_is_repeated(cell: Cell) -> No
 @pytest.mark.processes
 def test_it_keeps_the_rules_of_drivers(cell: Cell) -> None:
     cell.power(True)
-    found = check_driver(cell.driver, cable=cell.power, within=30.0, seconds=30.0)
+    found = check_driver(cell.driver, cable=cell.power, within=10.0, seconds=30.0)
     late = [fault for fault in found.faults if "took longer than the period" in fault]
     assert found.faults == late  # a busy host delays a step; none of its steps waits
 
