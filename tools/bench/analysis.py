@@ -90,6 +90,20 @@ def space_ours(name: str, engine: str) -> dict[str, Any]:
     return timed(work)
 
 
+def verdicts_ours(name: str) -> dict[str, Any]:
+    """Explore a net and find all verdicts on it."""
+    from petrobot.coordinator.analysis.net.qualitative import examine
+    from petrobot.coordinator.analysis.net.space import explore
+
+    net = SPACES[name]()
+    examine(explore(kanban(1)))  # imports and compiles
+    start = time.process_time()
+    space = explore(net)
+    explored = time.process_time() - start
+    said = timed(lambda: {"live": examine(space).live.holds, "states": len(space)})
+    return said | {"explored_seconds": explored}
+
+
 def space_snakes(name: str) -> dict[str, Any]:
     """Explore a net with SNAKES; stop after SLOW_STATES markings."""
     from snakes.nets import MultiArc, PetriNet, Place, StateGraph, Transition, Value, dot  # type: ignore[import-not-found]
@@ -310,6 +324,7 @@ def completion_ours(name: str, engine: str) -> dict[str, Any]:
 
 MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
     "space": space_ours,
+    "verdicts": verdicts_ours,
     "space-snakes": space_snakes,
     "space-pm4py": space_pm4py,
     "space-storm": space_storm,
@@ -398,6 +413,15 @@ def bench_spaces(names: tuple[str, ...]) -> None:
 def bench_stochastic(quick: bool) -> None:
     """Measure firings, long-run figures and completion."""
     tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
+    for name in QUICK if quick else ("fms-5", "kanban-5"):
+        said = measured("verdicts", name)
+        if said:
+            both = said["explored_seconds"] + said["seconds"]
+            tell(
+                f"all verdicts of {name}: {said['states']:,} states, explored in "
+                f"{said['explored_seconds']:.3f} s, explored and judged in {both:.3f} s "
+                f"({both / said['explored_seconds']:.2f} x), {said['megabytes']:.0f} MB"
+            )
     reference = None
     for what, measure in (("numpy", "firings"), ("SNAKES token game", "firings-snakes")):
         said = measured(measure, "kanban-2")
