@@ -63,8 +63,6 @@ def run(options: argparse.Namespace) -> int:
     """Stop, or clear. Return 0 if every device has carried it out and a stop is stored, 3
     otherwise."""
     from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
-    from petrobot.services.comm.protocol.messages import COORDINATOR
-    from petrobot.services.comm.tls.credentials import credentials
 
     address = _address(options)
     path = options.services or (
@@ -75,9 +73,7 @@ def run(options: argparse.Namespace) -> int:
     tell_of_demo(path, directory, f", or {HARDWARE}")
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
-    answers = asyncio.run(
-        order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus)
-    )
+    answers = asyncio.run(order_all(directory, verb, bus=options.bus))
     took = time.perf_counter() - begun
     coordinator = (
         asyncio.run(_tell(address, options.journal))

@@ -42,7 +42,6 @@ from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Stage
-from petrobot.coordinator.run.realtime import credentials_of
 from petrobot.coordinator.run.recording import JournalStore, digest
 from petrobot.coordinator.task import Scope, Task
 from petrobot.services.comm.location_file import Directory
@@ -314,7 +313,7 @@ class Operation:
         """Repeat the stop over separate connections: a node that is not connected or frozen is
         stopped over its bus, and the stop is latched."""
         directory = self.executor.directory
-        for told in await order_all(directory, credentials_of(directory)):
+        for told in await order_all(directory):
             if not told.done:
                 why = told.why or ", ".join(f"{d} {told.devices[d]}" for d in told.open)
                 why = why or told.note
@@ -332,6 +331,6 @@ class Operation:
                 self.watching.ask(node, CLEAR)
             return {"ok": True}
         directory = self.executor.directory
-        told = await order_all(directory, credentials_of(directory), CLEAR)
+        told = await order_all(directory, CLEAR)
         still = [f"{one.node}: {one.why or 'no answer'}" for one in told if not one.answered]
         return refusal("unreachable", "; ".join(still)) if still else {"ok": True}

@@ -20,9 +20,16 @@ from petrobot.coordinator.run.supervisor import is_local
 from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.protocol.messages import EMERGENCY_STOP, Answer, Command, Hello
+from petrobot.services.comm.protocol.messages import (
+    COORDINATOR,
+    EMERGENCY_STOP,
+    Answer,
+    Command,
+    Hello,
+)
+from petrobot.services.comm.protocol.security import KeyFileError
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
-from petrobot.services.comm.tls.credentials import Credentials
+from petrobot.services.comm.tls.credentials import Credentials, credentials
 from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
 
 STOP = EMERGENCY_STOP
@@ -103,7 +110,8 @@ class EmergencyLine:
     """A connection to one node only for emergency stops. The node accepts it with any
     services.toml: a stop must not fail because of a hash."""
 
-    def __init__(self, directory: Directory, node: str, credentials: Credentials) -> None:
+    def __init__(self, directory: Directory, node: str, proves: Credentials) -> None:
+        """Raises KeyFileError."""
         name = f"estop-{secrets.token_hex(4)}"
         entry = directory.nodes[node]
         caller = Caller(
@@ -122,8 +130,8 @@ class EmergencyLine:
             entry.port,
             caller,
             on_notices=self._hear,
-            key=credentials.key,
-            tls=credentials.client(),
+            key=proves.key,
+            tls=proves.client(),
         )
 
     async def connect(self, timeout: float) -> bool:
@@ -181,22 +189,20 @@ class EmergencyLine:
                 self.why = notice.reason
 
 
-async def order_all(
-    directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: bool = False
-) -> list[Stopped]:
+async def order_all(directory: Directory, verb: str = STOP, *, bus: bool = False) -> list[Stopped]:
     """Give an order to every node that owns devices, all at once; with `bus`, stop their buses
     without waiting for the nodes."""
     nodes = nodes_with_devices(directory)
-    return list(
-        await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes))
-    )
+    return list(await asyncio.gather(*(_order(directory, node, verb, bus) for node in nodes)))
 
 
-async def _order(
-    directory: Directory, credentials: Credentials, node: str, verb: str, bus: bool
-) -> Stopped:
+async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopped:
     stopped = Stopped(node)
-    line = EmergencyLine(directory, node, credentials)
+    line = None
+    try:
+        line = EmergencyLine(directory, node, credentials(directory, COORDINATOR))
+    except KeyFileError as fault:  # bus and latch need no key
+        stopped.why = str(fault)
     asking = asyncio.create_task(_ask(line, stopped, verb))
     try:
         if verb == STOP:
@@ -215,10 +221,11 @@ async def _order(
             stopped.latch = stopped.latch or await _latch(directory, node)
         elif stopped.answered:
             stopped.latch = ""  # The node was only late, and stores the stop itself.
-        if verb == CLEAR and not stopped.answered and not line.reached:
+        if verb == CLEAR and not stopped.answered and not (line and line.reached):
             stopped.latch, stopped.cleared = await _unlatch(directory, node)
     finally:
-        await line.close()
+        if line is not None:
+            await line.close()
     return stopped
 
 
@@ -231,8 +238,10 @@ async def _answered(stopped: Stopped, asking: asyncio.Task[None]) -> None:
         await asyncio.wait({asking}, timeout=ASK_AGAIN)
 
 
-async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
+async def _ask(line: EmergencyLine | None, stopped: Stopped, verb: str) -> None:
     """Repeat the order until all devices stand still; `seconds` is the time of the first answer."""
+    if line is None:
+        return
     loop = asyncio.get_running_loop()
     begun = loop.time()
     if await line.connect(STANDSTILL):

@@ -33,7 +33,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import MissionError
 from petrobot.coordinator.run.node_status import ask_all
-from petrobot.coordinator.run.realtime import UnreachableError, credentials_of
+from petrobot.coordinator.run.realtime import UnreachableError
 from petrobot.coordinator.run.recording import ReplayError
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError, loads
@@ -421,7 +421,7 @@ class Station:
 
     async def _order(self, verb: str) -> Answer:
         """Send an order directly to the nodes that own devices; report missing answers."""
-        told = await order_all(self.directory, credentials_of(self.directory), verb)
+        told = await order_all(self.directory, verb)
         missing = [
             f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered
         ]

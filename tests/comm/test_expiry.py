@@ -245,12 +245,12 @@ async def test_a_long_running_node_checks_every_day(
     assert all(one.tzinfo is not None for one in looked)
 
 
-@pytest.mark.parametrize(("node_left", "own_left"), [(-DAY, LIFE), (LIFE, -DAY)])
-async def test_an_expired_certificate_is_named_as_the_reason(
+@pytest.mark.parametrize(("node_left", "own_left"), [(-DAY, LIFE), (LIFE, -DAY), (2 * LIFE, LIFE)])
+async def test_an_expired_or_future_certificate_is_named_as_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], node_left: timedelta, own_left: timedelta
 ) -> None:
     """The caller is told whichever end's certificate has expired; for its own, with the file."""
-    folder = made(tmp_path / "keys", max(node_left, own_left), ())
+    folder = made(tmp_path / "keys", LIFE, ())
     make_certificates(folder, ["vision"], NOW - LIFE + node_left)
     make_certificates(folder, ["coordinator"], NOW - LIFE + own_left)
     async with asyncio.timeout(60.0), node(folder) as server:
@@ -267,6 +267,8 @@ async def test_an_expired_certificate_is_named_as_the_reason(
             "the certificate of vision, or that of its authority, has expired; make a new one"
             in client.trouble
         )
+    elif node_left > LIFE:
+        assert "certificate is not yet valid; set the clock of this" in client.trouble
     else:
         assert "has expired" in client.trouble
         assert (

@@ -15,7 +15,8 @@ def test_it_pings_and_then_gives_up() -> None:
     limit = Limit("the loss of the peer", steps=10)
     while (not seen or seen[-1][1] is not Beat.LOST) and limit.left():
         seen.append((heart.due(), heart.advance(heart.due())))
-    assert seen == [(0.25, Beat.PING), (0.5, Beat.PING), (0.75, Beat.PING), (1.0, Beat.LOST)]
+    assert seen[:3] == [(0.25, Beat.PING), (0.5, Beat.PING), (0.75, Beat.PING)]
+    assert seen[3:] == [(1.0, Beat.NOTHING), (1.0, Beat.LOST)], "sockets are read in between"
 
 
 def test_received_bytes_postpone_the_end() -> None:
@@ -26,8 +27,31 @@ def test_received_bytes_postpone_the_end() -> None:
     assert heart.due() == pytest.approx(10.0)
 
 
-def test_a_process_that_was_frozen_itself_reads_before_it_gives_the_other_side_up() -> None:
+@pytest.mark.parametrize(
+    "turns",
+    [(5.0,), (0.25, 0.95), (0.65, 1.05), (0.25, 0.6, 0.95)],
+    ids=["frozen once", "frozen while PONG was on its way", "late twice", "late at each turn"],
+)
+def test_time_in_which_this_process_did_not_run_is_no_silence_of_the_other_side(
+    turns: tuple[float, ...],
+) -> None:
     heart = Heartbeat(0.0, LinkTiming())
-    assert heart.advance(5.0) is Beat.PING
-    assert heart.due() == pytest.approx(5.25)
-    assert heart.advance(5.25) is Beat.LOST
+    late = 0.0
+    for now in turns:
+        late += now - heart.due()
+        assert heart.advance(now) is Beat.PING
+    limit = Limit("the loss of the peer", steps=10)
+    while heart.advance(heart.due()) is not Beat.LOST and limit.left():
+        pass
+    assert heart.due() == pytest.approx(1.0 + late)
+
+
+def test_what_arrived_while_this_process_was_frozen_is_read_before_the_other_side_is_lost() -> None:
+    heart = Heartbeat(0.0, LinkTiming())
+    for now in (0.25, 0.5, 0.75):
+        assert heart.advance(now) is Beat.PING
+    assert heart.advance(1.5) is Beat.NOTHING
+    heart.heard = 1.5
+    assert heart.due() == 1.5
+    assert heart.advance(1.5) is Beat.NOTHING
+    assert heart.due() == 1.75

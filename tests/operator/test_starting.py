@@ -302,7 +302,7 @@ async def test_an_emergency_stop_in_a_simulated_run_also_stops_the_real_devices(
     to stop as well."""
     orders: list[str] = []
 
-    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
+    async def order_all(directory: Any, verb: str) -> list[Any]:
         orders.append(verb)
         return []
 
@@ -330,7 +330,7 @@ async def test_a_stop_while_a_run_is_prepared_is_shown_and_nothing_starts(
 ) -> None:
     """Also in lock step, where no node would refuse the run."""
 
-    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
+    async def order_all(directory: Any, verb: str) -> list[Any]:
         return []
 
     monkeypatch.setattr(station, "order_all", order_all)
@@ -348,7 +348,7 @@ async def test_a_stop_that_a_node_did_not_clear_is_still_shown(
     """Its devices are still stopped: nothing starts, and the stop can be cleared again."""
     seconds: list[float | None] = [0.1, None, 0.1]
 
-    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Stopped]:
+    async def order_all(directory: Any, verb: str) -> list[Stopped]:
         return [Stopped("arm", seconds=seconds.pop(0), why="connection refused")]
 
     monkeypatch.setattr(station, "order_all", order_all)
@@ -375,7 +375,7 @@ async def test_a_stop_from_before_this_coordinator_is_shown(
         stopped = {"arm": {"emergency": ["gripper"]}, "vision": {}}
         return {node: {**about, "status": status} for node, status in stopped.items()}
 
-    async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
+    async def order_all(directory: Any, verb: str) -> list[Any]:
         return []
 
     monkeypatch.setattr(station, "ask_all", ask_all)

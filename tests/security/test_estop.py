@@ -283,6 +283,21 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
         find_address(folder=tmp_path)
 
 
+@pytest.mark.parametrize("keys", ['file = "cell.key"', 'certificates = "keys"'])
+async def test_a_key_that_cannot_be_used_does_not_keep_a_stop_from_bus_and_latch(
+    tmp_path: Path, keys: str
+) -> None:
+    """A wrong copy of a key, in the middle of its replacement, must not disarm the stop."""
+    source = cell_in(tmp_path).source
+    source.write_text(f"{source.read_text()}\n[keys]\n{keys}\n")
+    services = ["--services", str(source), "--journal", str(tmp_path)]
+    code, out, said = await finished(petrobot("estop", *services))
+    assert code == 3 and "NO ANSWER: " in out and "No such file" in out, said
+    assert "no CAN hub" in out and "latched" in out
+    code, out, _ = await finished(petrobot("estop", "--clear", *services))
+    assert code == 0 and "cleared on disk" in out
+
+
 async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
     """If the nodes end with the run, the stop could not be cleared otherwise: exit code 0, and the
     file is removed."""

@@ -54,6 +54,8 @@ _FOR_GOOD = frozenset(("version", "key_needed", "wrong_node"))
 proven WELCOME."""
 _EXPIRED = 10
 """X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
+_NOT_YET_VALID = 9
+"""X509_V_ERR_CERT_NOT_YET_VALID; many small computers have no clock that runs without power."""
 _NUMBERS = itertools.count(1)
 """Numbers of calls, shared by all clients of this process because two of them may have the same
 name and boot."""
@@ -363,7 +365,8 @@ class Client:
                 peer = self.caller.peer
                 text = f"the certificate of {peer}, or that of its authority, has expired"
                 return f"{text}; make a new one with `petrobot keys --tls` and copy it to {peer}"
-            return f"expected the certificate of {self.caller.peer}: {fault.verify_message}"
+            clock = "; set the clock of this computer" * (fault.verify_code == _NOT_YET_VALID)
+            return f"expected the certificate of {self.caller.peer}: {fault.verify_message}{clock}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
         if (
             isinstance(fault, OSError)

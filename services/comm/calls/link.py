@@ -101,26 +101,31 @@ class Beat(Enum):
 class Heartbeat:
     """Watches the silence of the other side (sans-I/O)."""
 
-    __slots__ = ("_due", "_timing", "heard")
+    __slots__ = ("_due", "_read_once", "_timing", "heard")
 
     def __init__(self, now: float, timing: LinkTiming) -> None:
         self._timing = timing
         self.heard = now
         """When something last arrived (s); set by the reader."""
         self._due = now + timing.heartbeat
+        self._read_once = False
+        """Whether it was time to give up, and only what has arrived was still to be read."""
 
     def advance(self, now: float) -> Beat:
         """Return what to do at `now`. Call it when `due`."""
-        late = now - self._due
-        if late > self._timing.silence / 2:
-            # This process itself stood still. What the other side sent meanwhile may still be in
-            # the socket, so give it one more heartbeat before it counts as lost.
-            self.heard = max(self.heard, now - self._timing.silence + self._timing.heartbeat)
-        silent = now - self.heard
-        if silent >= self._timing.silence:
-            return Beat.LOST
+        # Time in which this process did not run is no silence of the other side: what that one sent
+        # may still be in the socket, and on the same host it may not have run either.
+        awake = min(now, self._due)
+        if awake >= self.heard + self._timing.silence:
+            if self._read_once:
+                return Beat.LOST
+            # After SIGCONT asyncio handles its timers before it looks at its sockets.
+            self._read_once, self._due = True, now
+            return Beat.NOTHING
+        self._read_once = False
+        self.heard = min(now, self.heard + now - awake)
         self._due = min(now + self._timing.heartbeat, self.heard + self._timing.silence)
-        return Beat.PING if silent >= self._timing.heartbeat else Beat.NOTHING
+        return Beat.PING if now - self.heard >= self._timing.heartbeat else Beat.NOTHING
 
     def due(self) -> float:
         """Return when to call `advance` next (s)."""
