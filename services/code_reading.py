@@ -119,6 +119,27 @@ class _Seen:
     """Where it first uses `ctx.device` or `ctx.command` on every way, not in a branch, and which of
     them."""
 
+    def add(self, other: _Seen) -> None:
+        """Add the findings in another function or class. Where one place is kept, the first one
+        stays."""
+        self.faults += other.faults
+        self.doubtful += other.doubtful
+        self.lasts += other.lasts
+        self.causes |= other.causes
+        self.words |= other.words
+        self.puts |= other.puts
+        self.complete &= other.complete
+        self.any_event |= other.any_event
+        self.any_put |= other.any_put
+        self.memory = self.memory or other.memory
+        self.device = self.device or other.device
+        for name, kinds in other.values.items():
+            own = self.values.setdefault(name, {})
+            own |= kinds | own
+        for one in ("streams", "events", "calls", "gets", "reads", "uses"):
+            places: dict[str, tuple[str, int]] = getattr(self, one)
+            places |= getattr(other, one) | places
+
 
 @dataclass(frozen=True)
 class _Code:
@@ -130,6 +151,8 @@ class _Code:
     """Values of its global names."""
     bodies: tuple[CodeType, ...]
     """The function, or the methods of the class."""
+    found: dict[bool, _Seen] = field(default_factory=dict)
+    """The findings in it, by whether an action uses it (`_look`)."""
 
     @cached_property
     def nodes(self) -> tuple[ast.AST, ...]:
@@ -269,13 +292,37 @@ class _Code:
 
 
 @cache
-def _definitions(file: str) -> Mapping[tuple[str, int], ast.AST]:
-    """Return the functions and classes of a file, by name and first line, decorators included."""
+def _nodes_of_file(file: str) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(ast.parse(Path(file).read_bytes())))
+
+
+@cache
+def _functions(file: str) -> Mapping[tuple[str, int], ast.AST]:
+    """Return the functions of a file, by name and first line, decorators included."""
     return {
         (node.name, min([node.lineno, *(d.lineno for d in node.decorator_list)])): node
-        for node in ast.walk(ast.parse(Path(file).read_bytes()))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+        for node in _nodes_of_file(file)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
     }
+
+
+@cache
+def _classes(file: str) -> Mapping[str, ast.AST]:
+    """Return the classes of a file by qualified name, of several the first one: a class does not
+    know its line before Python 3.13."""
+    return dict(reversed([*_named_classes(_nodes_of_file(file)[0], "")]))
+
+
+def _named_classes(owner: ast.AST, prefix: str) -> Iterator[tuple[str, ast.AST]]:
+    for node in ast.iter_child_nodes(owner):
+        inner = prefix
+        if isinstance(node, ast.ClassDef):
+            yield prefix + node.name, node
+            inner = f"{prefix}{node.name}."
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            inner = f"{prefix}{node.name}.<locals>."
+        if not isinstance(node, ast.expr):
+            yield from _named_classes(node, inner)
 
 
 def _code(thing: Callable[..., Any]) -> _Code | None:
@@ -293,13 +340,10 @@ def _source(thing: Any) -> _Code | None:
     try:
         thing = inspect.unwrap(thing)
         file = str(inspect.getsourcefile(thing))
-        # to find the first line of a class, its whole file is parsed again
-        first = (
-            thing.__code__.co_firstlineno
-            if inspect.isfunction(thing)
-            else inspect.getsourcelines(thing)[1]
-        )
-        tree = _definitions(file)[thing.__name__, first]
+        if inspect.isfunction(thing):
+            tree = _functions(file)[thing.__name__, thing.__code__.co_firstlineno]
+        else:
+            tree = _classes(file)[thing.__qualname__]
         names = {**vars(sys.modules[thing.__module__]), **dict(_imported(tree))}
         methods = [thing] if inspect.isfunction(thing) else vars(thing).values()
         codes = [method.__code__ for method in methods if inspect.isfunction(method)]
@@ -340,9 +384,17 @@ def _reachable(thing: Any) -> Iterator[_Code]:
         waiting += (u for u in code.used if str(u.__module__).partition(".")[0] == package)
 
 
-def _look(code: _Code, seen: _Seen, in_action: bool) -> None:
-    """Record the findings in one function or class."""
-    _undefined(code, seen)
+def _look(code: _Code, in_action: bool) -> _Seen:
+    """Return the findings in one function or class. Many actions use the same ones, which are read
+    once."""
+    if in_action not in code.found:
+        seen = code.found[in_action] = _Seen()
+        _undefined(code, seen)
+        _look_at_nodes(code, seen, in_action)
+    return code.found[in_action]
+
+
+def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
     for node in code.nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
@@ -408,7 +460,7 @@ def _undefined(code: _Code, seen: _Seen) -> None:
 def _bound(file: str) -> frozenset[str]:
     """Return all names that a file binds anywhere, also under a condition."""
     found = set[str]()
-    for node in ast.walk(ast.parse(Path(file).read_bytes())):
+    for node in _nodes_of_file(file):
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             found.add(node.id)
         elif isinstance(node, ast.alias):
@@ -632,7 +684,7 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     if inspect.isfunction(inspect.unwrap(thing)):
         seen.any_put = inspect.unwrap(thing) is not thing or _code(thing) is None
         for code in _reachable(inspect.unwrap(thing)):
-            _look(code, seen, is_async)
+            seen.add(_look(code, is_async))
     else:
         seen.complete, seen.any_put = False, True
     own = _code(thing) if inspect.isfunction(thing) else None
@@ -704,7 +756,7 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         text = f"{name!r} is not a class; a driver is a class derived from `Driver`"
         return {"keys": {device: [["driver", text]] for device in tables}}
     for code in _reachable(thing):
-        _look(code, seen, in_action=False)
+        seen.add(_look(code, in_action=False))
         if issubclass(thing, Driver) and thing.period is not None:
             _steps(code, seen)
     if issubclass(thing, Driver):

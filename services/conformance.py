@@ -15,7 +15,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial, wraps
@@ -239,7 +239,7 @@ class _Check:
         except Exception as fault:
             self.fault(f"state: expected plain data, got {type(fault).__name__}: {fault}")
             return {}
-        self.leaves = dict(_leaves(state, "", LONGEST_ROW))
+        self.leaves = found = _leaves(state, LONGEST_ROW)
         self.sizes.append(Counter({key: _size(value) for key, value in state.items()}))
         if self.sizes[-1].total() > LARGEST_STATE:
             self.fault(
@@ -249,9 +249,8 @@ class _Check:
         if missing := [key for key in self.positions if key not in state]:
             self.fault(f"state: no {', '.join(missing)}, which should tell where it is")
         elif self.positions:
-            state = {key: state[key] for key in self.positions}
-        most = math.inf if self.positions else LONGEST_ROW
-        return {name: float(value) for name, value in _leaves(state, "", most) if _tells(value)}
+            found = _leaves({key: state[key] for key in self.positions})
+        return {name: float(value) for name, value in found.items() if _tells(value)}
 
     def thread_raised(self, raised: threading.ExceptHookArgs) -> None:
         if raised.exc_type is not SystemExit:
@@ -801,16 +800,23 @@ def _children() -> dict[int, str]:
     return found
 
 
-def _leaves(value: Any, path: str, most: float = math.inf) -> Iterator[tuple[str, Any]]:
-    """Yield the values in plain data, by path, without those of lists longer than `most`."""
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            yield from _leaves(part, f"{path}.{key}" if path else str(key), most)
-    elif isinstance(value, list):
-        for number, part in enumerate(value if len(value) <= most else ()):
-            yield from _leaves(part, f"{path}[{number}]", most)
-    else:
-        yield path, value
+def _leaves(data: Mapping[str, Any], most: float = math.inf) -> dict[str, Any]:
+    """Return the values in plain data, by path, without those of lists longer than `most`."""
+    found: dict[str, Any] = {}
+
+    def add(path: str, value: Any) -> None:
+        if type(value) is dict:
+            for key, part in value.items():
+                add(f"{path}.{key}", part)
+        elif type(value) is not list:
+            found[path] = value
+        elif len(value) <= most:
+            for number, part in enumerate(value):
+                add(f"{path}[{number}]", part)
+
+    for key, part in data.items():
+        add(key, part)
+    return found
 
 
 def _tells(value: Any) -> bool:
@@ -820,9 +826,9 @@ def _tells(value: Any) -> bool:
 
 def _size(value: Any) -> int:
     """Return the number of items and characters in plain data."""
-    if isinstance(value, Mapping):
+    if type(value) is dict:
         return len(value) + sum(map(_size, value.values()))
-    if isinstance(value, list):
+    if type(value) is list:
         return len(value) + sum(map(_size, value))
     return len(value) if isinstance(value, str | bytes) else 0
 

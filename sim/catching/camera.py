@@ -238,13 +238,11 @@ class PinholeCamera:
         up = np.array([0.0, 0.0, 1.0])
         direction = self.rays(pixels) @ self.rotation
         table = self._through(direction, np.array([0.0, 0.0, self.table.top]), up)
-        floor = self._through(direction, np.zeros(3), up)
         on_table = self.table.contains(table[..., 0], table[..., 1])
-        grey = np.where(
-            on_table,
-            self.table.grey(table[..., 0], table[..., 1]),
-            floor_grey(floor[..., 0], floor[..., 1]),
-        )
+        floor = self._through(direction[~on_table], np.zeros(3), up)
+        grey = np.empty(on_table.shape)
+        grey[on_table] = self.table.grey(table[on_table, 0], table[on_table, 1])
+        grey[~on_table] = floor_grey(floor[..., 0], floor[..., 1])
         if self.view.hidden is None:
             return grey
         return np.where(self._below_bridge(direction), BRIDGE_GREY, grey)

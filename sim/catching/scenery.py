@@ -78,7 +78,9 @@ class TableArea:
         grain = 3.0 * np.sin(23.0 * along + 2.0 * np.sin(3.0 * y)) * np.sin(140.0 * y)
         grey = TABLE_GREY + grain
         for mark_x, mark_y in MARKS:
-            grey = np.where(np.hypot(along - mark_x, y - mark_y) < MARK_RADIUS, MARK_GREY, grey)
+            near = np.nonzero((abs(along - mark_x) < MARK_RADIUS) & (abs(y - mark_y) < MARK_RADIUS))
+            distance = np.hypot(along[near] - mark_x, y[near] - mark_y)
+            grey[near] = np.where(distance < MARK_RADIUS, MARK_GREY, grey[near])
         grey = np.where(np.abs(y) < CENTRE_LINE / 2, LINE_GREY, grey)
         border = np.minimum.reduce([along, self.length - along, self.width / 2 - np.abs(y)])
         return np.where(border < SIDE_LINE, EDGE_GREY, grey)

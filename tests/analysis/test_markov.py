@@ -322,6 +322,7 @@ def test_what_if() -> None:
     assert long_run(Chain.of(smaller)).throughput["serve"] == pytest.approx(1 / (1 / 0.8 + 1 / 4.0))
 
 
+@pytest.mark.once
 def test_the_distribution_ends_where_rounding_begins() -> None:
     """Many jumps of a large chain leave larger rounding errors than the tolerance; the
     computation still ends."""

@@ -1165,6 +1165,7 @@ def test_a_counter_of_errors_that_nothing_reads_is_no_error_state(
     assert (missed.possible.holds, missed.kappa) == (back, kappa)
 
 
+@pytest.mark.once
 def test_the_shipped_tasks_may_run() -> None:
     for path in sorted(TASKS.glob("*.toml")):
         found = judged(load(path))

@@ -267,6 +267,7 @@ def test_scipy_and_plain_components_agree(seed: int) -> None:
     assert len(np.unique(np.stack([ours, graph.components]), axis=1).T) == len(np.unique(ours))
 
 
+@pytest.mark.once
 def test_a_deadlock_far_outside_a_partial_search_is_found() -> None:
     """300 places and about 1e28 markings: the deadlock is found, with a witness."""
     net = philosophers(60)

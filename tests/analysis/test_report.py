@@ -160,6 +160,7 @@ def test_partial_and_unbounded_nets_are_reported_as_such() -> None:
     assert any("simulate instead" in note for note in data["notes"])
 
 
+@pytest.mark.once
 def test_the_catching_task_in_one_analysis() -> None:
     found = analyse(load(CATCH), view="gspn", stages=2)
     data = json.loads(json.dumps(found.to_json()))
@@ -256,6 +257,7 @@ def test_a_faster_action_saves_the_time_that_the_forecast_says() -> None:
     )
 
 
+@pytest.mark.once
 def test_simulation_and_solution_of_the_catching_task_agree() -> None:
     exact = forecast(stochastic_view(load(CATCH), stages=3, timer_stages=3))
     seen = simulate_command(CATCH, np.random.default_rng(5), replicas=400, stages=3)
@@ -368,6 +370,7 @@ def answers(data: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
         yield from answers(value, (*path, key))
 
 
+@pytest.mark.once
 @settings(COMMON, max_examples=6)
 @given(st.one_of(nets(), whole_tasks()))
 @example(kanban(1))

@@ -237,6 +237,7 @@ def figures_agree(task: Task, measured: Measured | None = None) -> None:
     event(f"completes: {found.completion_probability > 1 - 1e-9}")
 
 
+@pytest.mark.once
 @settings(COMMON, max_examples=25)
 @given(tasks())
 @example(never_begun())
@@ -267,6 +268,7 @@ def timer_before_a_full_place(capacity: int) -> Task:
     )
 
 
+@pytest.mark.once
 @settings(COMMON, max_examples=25)
 @given(any_tasks())
 @example(timer_before_a_full_place(1))
@@ -489,6 +491,7 @@ class Clock:
                 self.ended = one.status
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("kind", KINDS)
 def test_missions_of_the_engine_have_the_figures_of_the_view(kind: str) -> None:
     """Shares and mean within five standard errors of 600 missions."""
@@ -766,6 +769,7 @@ def short_forms(draw: st.DrawFn) -> tuple[Task, Measured]:
     return task, Measured(runs, choice, causes=known)
 
 
+@pytest.mark.once
 @settings(COMMON, max_examples=40)
 @given(short_forms())
 def test_the_causes_of_ends_decide_conditions_in_both_views(case: tuple[Task, Measured]) -> None:
@@ -865,6 +869,7 @@ def with_deadline(seconds: float, tries: int, *, told: bool) -> Task:
     return replace(task, places={**task.places, "work": work})
 
 
+@pytest.mark.once
 @settings(COMMON, max_examples=8)
 @given(st.floats(0.3, 8.0), st.integers(1, 3), st.booleans(), st.integers(0, 99))
 @example(0.5, 1, True, 0)

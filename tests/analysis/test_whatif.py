@@ -20,6 +20,7 @@ from tests.analysis.broken import TASKS
 CATCH = TASKS / "catch_ball.toml"
 
 
+@pytest.mark.once
 def test_changed_tokens_equal_those_in_a_file(tmp_path: Path) -> None:
     """runs=2 gives the same result as a file with two tokens."""
     edited = tmp_path / "two.toml"
@@ -82,6 +83,7 @@ def test_shares_that_add_up_to_one_are_accepted() -> None:
         change_task(task, Measured(), [read_change(text) for text in too_many])
 
 
+@pytest.mark.once
 def test_improvements_improve_the_result() -> None:
     """Fewer errors complete more often; a status that never occurred may be given a share."""
     task = load(CATCH)

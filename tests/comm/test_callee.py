@@ -326,6 +326,7 @@ def _called_and_acknowledged(callee: Callee, *ids: str) -> None:
     _said(callee)
 
 
+@pytest.mark.once
 def test_ids_that_count_up_are_never_forgotten() -> None:
     """Neither by number nor by age: tried with a day, and with twice the number of calls after
     which ids were once forgotten."""

@@ -148,6 +148,7 @@ def rows_of(trials: list[Trial]) -> list[TrialRow]:
     return [TrialRow(i, "", 1, 1, 1, 0.0, trial) for i, trial in enumerate(trials, 1)]
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_the_recorded_rate_is_that_of_the_event(memory: str) -> None:
     """The table of a campaign, the learner of `run --learn`, the stochastic view and the simulated

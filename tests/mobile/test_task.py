@@ -65,6 +65,7 @@ def test_all_events_are_internal_and_conflicts_are_settled_by_variables(task: Ta
                 )
 
 
+@pytest.mark.once
 def test_the_state_space_has_the_required_properties() -> None:
     data = analyse_command(PATH, limits=SearchLimits()).data
     assert data["complete"] and data["states"] < 10_000

@@ -153,6 +153,7 @@ def _caught(rig: Any, regime: tuple[float, float], number: int, **how: Any) -> i
 REGIMES = {"A": (0.7, 1.5), "B": (1.5, 2.0), "C": (2.0, 2.5)}
 
 
+@pytest.mark.once
 @pytest.mark.parametrize(("regime", "noise"), [("A", 0.02), ("B", 0.02), ("C", 0.02), ("C", 0.0)])
 def test_tilted_catches_nearly_all(rig: Any, regime: str, noise: float) -> None:
     number = 5

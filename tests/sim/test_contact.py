@@ -375,6 +375,7 @@ def shoot(space: BallContact, rng: np.random.Generator) -> set[tuple[str, str]]:
     return seen
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("seed", range(60))
 def test_nothing_passes_through_a_wall_or_the_bottom(space: BallContact, seed: int) -> None:
     """The ball enters and leaves the cup only through its mouth, at up to 5 m/s relative to a cup

@@ -109,6 +109,7 @@ def test_old_records_count_as_bullets() -> None:
     assert not same_physics("", NOW) and not same_physics(NOW, FIRST_PHYSICS)
 
 
+@pytest.mark.once
 def test_only_one_module_imports_pybullet() -> None:
     found = [
         name

@@ -136,6 +136,7 @@ def any_arm(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
     )
 
 
+@pytest.mark.once
 @needs_bullet
 @pytest.mark.parametrize("case", ["bare", "loaded", *range(6)])
 def test_the_back_ends_agree_on_the_arm(arm: PumaModel, case: str | int) -> None:
@@ -172,6 +173,7 @@ def any_puma(arm: PumaModel, rng: np.random.Generator) -> PumaModel:
     )
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("case", range(6))
 def test_the_algorithms_without_zero_terms_agree_with_the_general_ones(
     arm: PumaModel, case: int

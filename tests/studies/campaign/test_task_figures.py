@@ -101,6 +101,7 @@ def test_measured_and_composed_figures_have_one_definition() -> None:
         assert low < found[name] < high
 
 
+@pytest.mark.once
 def test_the_intervals_hold_in_repeated_campaigns() -> None:
     """C and J of the hardest regime, with rho = 0.2: failures are followed by long runs, so R and C
     depend on each other. At least 85 of 100."""

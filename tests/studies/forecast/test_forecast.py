@@ -183,6 +183,7 @@ def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_trials: Ma
     )
 
 
+@pytest.mark.once
 def test_predictive_intervals_cover(pair: Task, make_trials: Make) -> None:
     """In 40 worlds, nearly all 95 % intervals for R_goal and the mean cover the true value (99.9 %
     binomial bound)."""
