@@ -42,12 +42,12 @@ def forecast_text(made: Mapping[str, Any]) -> str:
         for figure, found in said["figures"].items():
             if found["value"] is not None:
                 lines.append(
-                    f"    {WORDS[figure]:20}{_digits(found['value'])}  95 % of new trials "
-                    f"{_bounds(found['interval'])}, of the truth {_bounds(found['confidence'])}"
+                    f"    {WORDS[figure]:18}{_digits(found['value'])}  95 %: new trials "
+                    f"{_bounds(found['interval'])}, the truth {_bounds(found['confidence'])}"
                 )
         lines += _exact_lines(said.get("gspn", {}))
         lines.append(
-            f"    product of R's      {said['product']['R_conj']:.4f} as R_conj, if statuses "
+            f"    product of R's    {said['product']['R_conj']:.4f} as R_conj, if statuses "
             "were independent"
         )
         for found in said["dependence"][:3]:
