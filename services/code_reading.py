@@ -406,6 +406,8 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
                 seen.device or node in code.branched or code.asks_for_device
             ):
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
+        if in_action and isinstance(node, ast.Attribute):
+            _misspelt(code, node, seen)
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in DEVICE:
             guarded = node.value in code.branched or node in code.tried or code.asks_for_device
             if isinstance(node.ctx, ast.Load) and not guarded:
@@ -496,6 +498,17 @@ def _loops(code: _Code, loop: ast.While, seen: _Seen) -> None:
             "this loop never ends, as nothing else runs meanwhile, not even the clock; wait in it"
         )
         seen.faults.append((code.file, loop.lineno, f"{text} by `await ctx.sleep(...)`"))
+
+
+def _misspelt(code: _Code, node: ast.Attribute, seen: _Seen) -> None:
+    """Record a name that the context lacks, if it is close to one that it has: something else may
+    be called `context`, too."""
+    owner, known = ast.unparse(node.value), dir(actions.Context)
+    if owner not in CONTEXT or node.attr in known:
+        return
+    if close := difflib.get_close_matches(node.attr, known, n=1):
+        text = f"`{owner}` has no `{node.attr}`; did you mean `{owner}.{close[0]}`?"
+        seen.doubtful.append((code.file, node.lineno, text))
 
 
 def _unawaited(code: _Code, node: ast.Call, seen: _Seen) -> None:

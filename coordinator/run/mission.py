@@ -83,6 +83,15 @@ class Cycle:
     """By run, in the order in which they ended: status, cause and text."""
     forgotten: tuple[Status, str, str] = (Status.SUCCESS, "", "")
     """The worst of the older runs, of which nothing else is kept."""
+    goals: int = 0
+    """Firings of goal transitions."""
+    errors: int = 0
+    """Runs that ended in ERROR and were not cancelled."""
+
+    @property
+    def lost(self) -> int:
+        """Number of its errors if it met no goal, else 0."""
+        return 0 if self.goals else self.errors
 
     def count(self, run: str, status: Status | None, cause: str, text: str) -> None:
         """Add a run, or the verdict on an earlier one."""
@@ -124,9 +133,10 @@ def _count(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def _forget_oldest(entries: list[Any]) -> None:
-    if len(entries) >= 2 * KEPT:
-        del entries[:KEPT]
+def _forget_oldest(entries: list[Any]) -> list[Any]:
+    oldest = entries[:KEPT] if len(entries) >= 2 * KEPT else []
+    del entries[: len(oldest)]
+    return oldest
 
 
 @dataclass
@@ -154,13 +164,18 @@ class MissionTally:
     """Values that a result lacked."""
     first_missing: str = ""
     cycles: list[Cycle] = field(default_factory=list)
+    older_lost: int = 0
+    """Errors in forgotten cycles that met no goal."""
     runs: list[RunRecorded] = field(default_factory=list)
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Count."""
         if isinstance(instruction, Fired):
             self.firings += 1
-            self.goals += instruction.transition in self.goal_transitions
+            if instruction.transition in self.goal_transitions:
+                self.goals += 1
+                if self.cycles:
+                    self.cycles[-1].goals += 1
             self._cycle(now, instruction.before, instruction.after)
         elif isinstance(instruction, Marked) and instruction.place and self.runs_place is not None:
             before, after = instruction.before, instruction.after
@@ -168,9 +183,10 @@ class MissionTally:
         elif isinstance(instruction, RunRecorded):
             _forget_oldest(self.runs)
             self.runs.append(instruction)
-            self._judge(instruction, 1)
+            failed = self._judge(instruction, 1)
             self.ended += not instruction.cancelled
             if self.cycles:
+                self.cycles[-1].errors += failed
                 self.cycles[-1].count(
                     instruction.run, instruction.status, instruction.cause, instruction.text
                 )
@@ -206,43 +222,51 @@ class MissionTally:
             if self.failed[key] > 0  # a verdict may have taken the last error of a cause away
         ]
 
-    def happened(self, recovered: bool) -> str:
+    def happened(self, recovered: bool, missed: bool = False) -> str:
         """Return what happened on the way, in words: number of runs, errors by primitive task and
-        cause, and values that a result lacked. `recovered`: the task reached its end and met each
-        goal, so its errors cost none."""
+        cause, and values that a result lacked. `recovered`: the task reached its end as designed;
+        `missed`: it met fewer goals than it was asked for."""
         failed = +self.failed  # a verdict may have taken the last error of a cause away
         parts = [_count(self.ended, "run")]
         if failed:
             causes = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in failed.items())
             told = ", all recovered" if recovered else ""
+            lost = self.older_lost + sum(cycle.lost for cycle in self.cycles)
+            if told and missed and (lost := lost if self.cycles else failed.total()):
+                told += f", {lost} of them where a goal was missed"
             parts.append(f"{_count(failed.total(), 'error')}{told} [{causes}]")
         if self.missing:
             parts.append(f"{_count(self.missing, 'value')} missing [{self.first_missing}]")
         return "; ".join(parts)
 
-    def _judge(self, record: RunRecorded, count: int) -> None:
+    def _judge(self, record: RunRecorded, count: int) -> int:
+        """Add a run (`count` = 1), or take it away (-1); return the change of the errors."""
         if record.status is Status.ERROR and not record.cancelled:
             key = f"{record.primitive_task}: {record.cause or 'no cause'}"
             self.failed[key] += count
             if count > 0:
                 self.examples.pop(key, None)  # a later one goes to the end
                 self.examples[key] = record
-        elif record.status is Status.FAILURE and not record.cancelled:
+            return count
+        if record.status is Status.FAILURE and not record.cancelled:
             self.failure = record
+        return 0
 
     def _correct(self, corrected: Corrected) -> None:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
+        change = 0
         for n in reversed(range(len(self.runs))):
             if self.runs[n].run == run:
-                self._judge(self.runs[n], -1)
+                change = self._judge(self.runs[n], -1)
                 self.runs[n] = replace(
                     self.runs[n], status=said[0], cause=said[1], text=said[2], deferred=False
                 )
-                self._judge(self.runs[n], 1)
+                change += self._judge(self.runs[n], 1)
                 break
         for cycle in reversed(self.cycles):
             if run in cycle.ends:
                 cycle.count(run, *said)
+                cycle.errors += change
                 break
 
     def _cycle(self, now: float, before: Marking, after: Marking) -> None:
@@ -250,7 +274,7 @@ class MissionTally:
             return
         if self.cycles:
             self.cycles[-1].ended = now
-        _forget_oldest(self.cycles)
+        self.older_lost += sum(cycle.lost for cycle in _forget_oldest(self.cycles))
         self.cycles.append(Cycle(self.begun + 1, now))
 
 
@@ -379,7 +403,6 @@ class Mission:
         failure = self.tally.failure if failed and not errors else None
         has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
         wanted = self.runs + self.tally.added
-        recovered = not failed and (not has_goal or met >= wanted)
         # A run may meet several goals: "4 of 2" would be no share.
         within = f"of {wanted}" if met <= wanted else f"in {wanted} run{'s' * (wanted != 1)}"
         general = {
@@ -391,7 +414,7 @@ class Mission:
             "status": finished.status.value if finished else Status.ERROR.value,
             "reason": finished.reason if finished else "not finished",
             **({"goals": f"{met} {within}"} if has_goal else {}),
-            "happened": self.tally.happened(recovered),
+            "happened": self.tally.happened(not failed, has_goal and met < wanted),
             **({"last_errors": errors} if errors else {}),
             **({"last_failure": _row(failure, self.executor.directory)} if failure else {}),
             **self.remarks,

@@ -433,6 +433,35 @@ def test_an_open_condition_of_a_timer_is_assumed_to_hold() -> None:
     )
 
 
+LAMP = """
+schema = 1
+[task]
+name = "cross"
+final = "over == 1"
+[primitive_tasks]
+look = { deadline = 9.0, estimates = { success = { share = 1.0, mean = 1.0, cv = 1.0 } } }
+[variables]
+lamp = { type = "str", values = ["green", "red"] }
+[places]
+look = { kind = "action", tokens = 1, out = { lamp = "lamp" } }
+seen = {}
+over = {}
+[transitions]
+looked = { in = ["look:normal"], out = ["seen"] }
+blind = { in = ["look:error"], out = ["over"] }
+go = { in = ["seen"], out = ["over"], when = "lamp == 'green'" }
+stay = { in = ["seen"], out = ["look"], when = "lamp == 'red' or lamp == none" }
+"""
+
+
+def test_a_value_that_may_be_missing_does_not_count_twice() -> None:
+    """Two values lead to `stay`: its measured frequency is that of both."""
+    often = Measured(switches={"go": 0.6, "stay": 0.4})
+    chain, _, found = in_both(execute(loads(LAMP, "cross.toml")), often)
+    assert found.figures["mean time (s)"] == pytest.approx(1 / 0.6, rel=1e-3)
+    assert chain.figures == pytest.approx(found.figures, nan_ok=True)
+
+
 class Clock:
     """The world of one mission run: runs, events and timers at exponential or fixed times."""
 

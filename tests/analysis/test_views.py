@@ -31,6 +31,7 @@ from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.analysis.time.whatif import change_task, read_change
 from petrobot.coordinator.task import (
     Counts,
+    EarlyEvent,
     End,
     Estimate,
     Event,
@@ -138,6 +139,21 @@ def test_every_rate_has_its_source() -> None:
     assert view.numbers["measured in 7 runs"] == ("act.slow",)
     assert view.numbers["declared in the task file"] == ("act.fast",)
     assert view.sources["act.slow"] == "assumed equally likely"
+
+
+def test_an_event_that_may_come_early_has_its_source_too() -> None:
+    """It has a place of its own, and comes however the task goes."""
+    kept = Event("hit", Scope.EXTERNAL, EventMemory.LATCHED, EarlyEvent.KEEP, mean_wait=3.0)
+    task = task_of(
+        [],
+        [Place("idle", Kind.CONTROL, 1), Place("done", Kind.CONTROL)],
+        [Transition("go", (Input("idle"),), (Output("done"),), events=("hit",))],
+        "done == 1",
+        events={"hit": kept},
+    )
+    view = stochastic_view(task)
+    assert view.numbers["mean wait declared in the task file"] == ("hit",)
+    assert any(text.startswith("hit: comes at any time") for text in view.assumptions)
 
 
 def test_a_change_overrides_measurements() -> None:

@@ -480,6 +480,12 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        "await ctx.command({",
+        "await ctx.comand({",
+        r"warning arm_bot.py:\d+: `ctx` has no `comand`; did you mean `ctx.command`",
+    ),
+    (
+        CODE,
         "if not await ctx.wait(",
         "if not ctx.wait(",
         r"arm_bot.py:\d+: `ctx.wait` does nothing",
@@ -1006,6 +1012,7 @@ WARNINGS = (
     "--dry-run is refused",
     "`steps` of",
     "asyncio.sleep",
+    "has no `comand`",
 )
 
 

@@ -15,6 +15,7 @@ phases of the chain, and of the stochastic view, do to a figure.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -718,9 +719,11 @@ class _Builder:
         different = {self.leads_to(o): o for o in outcomes}
         if len(different) == 1:
             return [outcomes[0]]
+        # Results with the same firings share one frequency: a lamp that is red, or unknown, stops.
+        alike = Counter(map(self.fired, different.values()))
         weights = []
         for one in different.values():
-            weight = 1.0
+            weight = 1.0 / alike[self.fired(one)]
             for name in self.fired(one):
                 weight *= self.measured.switches.get(name, 1.0)
             weights.append(weight)

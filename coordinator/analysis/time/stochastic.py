@@ -221,6 +221,8 @@ class StochasticView:
     """Transitions of the GSPN by which a run ends that counts as FAILURE or ERROR."""
     doubts: tuple[str, ...] = ()
     """Numbers that do not measure what the view takes them for."""
+    comes: Mapping[str, str] = field(default_factory=dict)
+    """By timed transition that only lets an event come: the event."""
 
     def projected(self, marking: Marking) -> Marking:
         """Return the marking of the ordinary net that a marking of the GSPN projects to."""
@@ -253,11 +255,11 @@ class StochasticView:
 
     @cached_property
     def numbers(self) -> dict[str, tuple[str, ...]]:
-        """By source: the actions (`place.action`) and transitions whose numbers come from it."""
+        """By source: the actions (`place.action`), transitions and events whose numbers are its."""
         out: dict[str, dict[str, None]] = {}
         for name, (place, action, _) in self.statuses.items():
             out.setdefault(self.sources[name], {})[f"{place}.{action}"] = None
-        for case, name in self.origin.items():
+        for case, name in (*self.origin.items(), *self.comes.items()):
             if case in self.sources:
                 out.setdefault(self.sources[case], {})[name] = None
         return {source: tuple(names) for source, names in out.items()}
@@ -313,6 +315,7 @@ class _Derivation:
         self.errors: dict[str, float] = {}
         self.possible: dict[str, set[Status]] = {}
         self.sources: dict[str, str] = {}
+        self.comes: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
         self.waiting: set[str] = set()
         """Places in which a run waits for its device."""
@@ -399,6 +402,7 @@ class _Derivation:
             self.sources,
             frozenset(self.spoils),
             tuple(self.doubts),
+            self.comes,
         )
 
     # Transitions of the GSPN.
@@ -610,6 +614,7 @@ class _Derivation:
             for phase in active:
                 label = f"{name}.raises {event} in {phase}"
                 self._timed(label, {phase: 1}, {phase: 1, flag: 1}, 1.0 / mean, source)
+                self.comes[label] = event
                 self.inhibit[label] = {flag: 1}
             forget = f"{name}.forgets {event}"
             self._immediate(forget, {flag: 1}, {}, 1.0, FLUSH - 1)
@@ -824,6 +829,11 @@ class _Derivation:
             need, self.inhibit[name] = self._named(case)
             self.inhibit[name][flag] = 1
             self._timed(name, need, {**need, flag: 1}, rate, source, 1)
+            self.comes[name] = event.name
+        if kept:
+            self.assumptions.append(
+                f"{event.name}: comes at any time, at a constant rate, whatever the task does"
+            )
         if is_pulse(event):
             self._pulse(flag, waiting)
             return

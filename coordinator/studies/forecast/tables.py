@@ -42,12 +42,12 @@ def forecast_text(made: Mapping[str, Any]) -> str:
         for figure, found in said["figures"].items():
             if found["value"] is not None:
                 lines.append(
-                    f"    {WORDS[figure]:20}{_digits(found['value'])}  95 % of new trials "
-                    f"{_bounds(found['interval'])}, of the truth {_bounds(found['confidence'])}"
+                    f"    {WORDS[figure]:18}{_digits(found['value'])}  95 %: new trials "
+                    f"{_bounds(found['interval'])}, the truth {_bounds(found['confidence'])}"
                 )
         lines += _exact_lines(said.get("gspn", {}))
         lines.append(
-            f"    product of R's      {said['product']['R_conj']:.4f} as R_conj, if statuses "
+            f"    product of R's    {said['product']['R_conj']:.4f} as R_conj, if statuses "
             "were independent"
         )
         for found in said["dependence"][:3]:
@@ -59,16 +59,15 @@ def forecast_text(made: Mapping[str, Any]) -> str:
         lines.append(f"    simulated net: {said['contexts']} contexts; {_worst(said)}")
         if 0.0005 < said["endless"] <= NEGLIGIBLE:
             lines.append(f"    note: {said['endless']:.1%} of the simulated trials never end")
-        told = [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
-        told += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
-        lines += [wrapped(line, 8) for line in told]
+        lines += [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
+        lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
     if "assumed" in made and any("gspn" in said for said in made["regimes"].values()):
         lines.append(
             f"  measured trials include waits for devices; the simulated net and the exact "
             f"solution assume: "
             f"{made['assumed']}"
         )
-    return "\n".join(lines)
+    return "\n".join(wrapped(line, 8) for line in lines)
 
 
 def _digits(value: float) -> str:
@@ -90,7 +89,7 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
             f"      its P_complete: 95 % {_bounds(gspn['P_complete_interval'])} from the measured "
             f"shares; relative error of the solution {gspn['P_complete_error']:.0e}"
         )
-    return [*lines, *(wrapped(f"      {note}", 8) for note in gspn.get("notes", ()))]
+    return [*lines, *(f"      {note}" for note in gspn.get("notes", ()))]
 
 
 def _worst(said: Mapping[str, Any]) -> str:

@@ -249,6 +249,7 @@ def test_a_place_that_training_never_entered_forbids_nothing(
     assert main([*told, "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     assert "no training run entered repair: forecast with probability 0 (below 0.015" in shown
+    assert len(max(shown.splitlines()[:-1], key=len)) <= 100  # the last one has the file's path
     made = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
     assert made["figures"]["P_complete"]["value"] == 1.0
     assert made["gspn"]["P_complete"] == pytest.approx(1.0, abs=1e-12)
