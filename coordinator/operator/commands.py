@@ -42,7 +42,7 @@ from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Stage
-from petrobot.coordinator.run.recording import JournalStore, digest
+from petrobot.coordinator.run.recording import JournalStore, digest, mission_time
 from petrobot.coordinator.task import Scope, Task
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Feedback
@@ -273,7 +273,7 @@ class Operation:
         except JournalError as fault:
             self.shell.fail(fault)
             return refusal("journal", str(fault))
-        time = round(now - self.publisher.origin, 4)
+        time = round(mission_time(now, self.publisher.origin), 4)
         notice = {"level": "info", "text": remark.told, "at": time}
         self.feed.emit("notice", time=time, notice=notice)
         return {"ok": True}

@@ -39,6 +39,7 @@ from petrobot.coordinator.operator.event_texts import (
 )
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.port import Feed
+from petrobot.coordinator.run.recording import mission_time
 from petrobot.coordinator.task import End, Executed, Scope, Task
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import Severity
@@ -129,7 +130,7 @@ class ChangePublisher:
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Publish a stimulus that the engine receives."""
-        time = now - self.origin
+        time = mission_time(now, self.origin)
         self._stimulus = stimulus
         if isinstance(stimulus, Chosen):
             self._why[stimulus.key] = stimulus.reason
@@ -147,17 +148,20 @@ class ChangePublisher:
         """Publish an instruction or a record of the engine."""
         tell = self._tell.get(type(instruction))
         if tell is not None:
-            tell(now - self.origin, instruction)
+            tell(mission_time(now, self.origin), instruction)
 
     def progress(self, now: float, run: str, notice: Feedback) -> None:
         """Publish the progress of a run."""
         self.feed.emit(
-            "run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4)
+            "run_progress",
+            time=mission_time(now, self.origin),
+            id=run,
+            progress=round(notice.fraction, 4),
         )
 
     def settled(self, now: float, state: State) -> None:
         """Publish what changed after the engine has handled a stimulus."""
-        time, seen = now - self.origin, self._seen
+        time, seen = mission_time(now, self.origin), self._seen
         if seen is None or seen.flags != state.flags:
             self._flags(time, seen.flags if seen else frozenset(), state.flags)
         if seen is None or seen.variables is not state.variables:

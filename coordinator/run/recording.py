@@ -91,6 +91,12 @@ def digest(records: Sequence[Instruction | Stimulus]) -> int:
     return zlib.crc32(packed)
 
 
+def mission_time(now: float, origin: float) -> float:
+    """Return the time since the mission's clock was 0 (s), as the journal stores it. Whoever shows
+    a time rounds this one further: otherwise journal and page may differ in the last digit."""
+    return round(now - origin, 6)
+
+
 class JournalStore:
     """The executor's store in a journal: each stimulus with the marking and a digest of the
     instructions that followed."""
@@ -110,7 +116,7 @@ class JournalStore:
         without it."""
         try:
             data = {
-                "t": round(now - self.origin, 6),
+                "t": mission_time(now, self.origin),
                 "stimulus": to_plain(stimulus),
                 "marking": list(state.marking),
                 "instructions": digest(instructions),
@@ -131,7 +137,8 @@ class JournalStore:
         if len(text) > LONGEST_REMARK:
             found = f"found {len(text):,}"
             raise ValueError(f"text: expected at most {LONGEST_REMARK:,} characters, {found}")
-        remark = Remark(self.writer.next_number, round(now - self.origin, 6), author, text.strip())
+        time = mission_time(now, self.origin)
+        remark = Remark(self.writer.next_number, time, author, text.strip())
         self.record(REMARK, {"t": remark.time, "author": author, "text": remark.text})
         return remark
 

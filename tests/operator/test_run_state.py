@@ -15,6 +15,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.operator.run_state import ChangePublisher
+from petrobot.coordinator.run.recording import mission_time
 from petrobot.coordinator.task import Counts
 from petrobot.coordinator.task.file import loads
 from tests.operator.conftest import TASK
@@ -51,3 +52,13 @@ def test_the_time_in_which_a_run_was_held_is_known(
             publisher.instruction(100.0 + time, step)
     run = publisher.feed.state["runs"][RUN]
     assert (run["started"], run["held_since"], run["held_for"]) == (1.0, since, held)
+
+
+@pytest.mark.parametrize("now", [0.006349999, 0.006350001, 0.31764999999, 12.34565000001])
+def test_a_time_is_rounded_as_the_journal_rounds_it(now: float) -> None:
+    """Page and log may not differ in the last digit."""
+    publisher = ChangePublisher(Feed(), loads(TASK, "moving.toml"))
+    publisher.begin("m", "realtime")
+    publisher.instruction(now, StartRun(RUN, "look", "look", "look_twice", {}, 5.0))
+    stored = mission_time(now, 0.0)
+    assert stored != now and publisher.feed.state["runs"][RUN]["started"] == round(stored, 4)
