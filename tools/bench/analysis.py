@@ -410,9 +410,8 @@ def bench_spaces(names: tuple[str, ...]) -> None:
                 line(what, said, "states", reference)
 
 
-def bench_stochastic(quick: bool) -> None:
-    """Measure firings, long-run figures and completion."""
-    tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
+def bench_solutions(quick: bool) -> None:
+    """Measure verdicts, firings, long-run figures and completion."""
     for name in QUICK if quick else ("fms-5", "kanban-5"):
         said = measured("verdicts", name)
         if said:
@@ -422,6 +421,7 @@ def bench_stochastic(quick: bool) -> None:
                 f"{said['explored_seconds']:.3f} s, explored and judged in {both:.3f} s "
                 f"({both / said['explored_seconds']:.2f} x), {said['megabytes']:.0f} MB"
             )
+    tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
     reference = None
     for what, measure in (("numpy", "firings"), ("SNAKES token game", "firings-snakes")):
         said = measured(measure, "kanban-2")
@@ -463,7 +463,7 @@ def main() -> None:
         one(*options.one)
         return
     bench_spaces(QUICK if options.quick else tuple(SPACES))
-    bench_stochastic(options.quick)
+    bench_solutions(options.quick)
     if options.write:
         options.write.write_text(page(), encoding="utf-8")
 
