@@ -232,7 +232,9 @@ class MissionTally:
             causes = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in failed.items())
             told = ", all recovered" if recovered else ""
             lost = self.older_lost + sum(cycle.lost for cycle in self.cycles)
-            if told and missed and (lost := lost if self.cycles else failed.total()):
+            if not self.cycles:  # a task without trials: its one goal was missed
+                lost = failed.total()
+            if told and missed and lost:
                 told += f", {lost} of them where a goal was missed"
             parts.append(f"{_count(failed.total(), 'error')}{told} [{causes}]")
         if self.missing:

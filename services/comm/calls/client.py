@@ -365,7 +365,8 @@ class Client:
                 peer = self.caller.peer
                 text = f"the certificate of {peer}, or that of its authority, has expired"
                 return f"{text}; make a new one with `petrobot keys --tls` and copy it to {peer}"
-            clock = "; set the clock of this computer" * (fault.verify_code == _NOT_YET_VALID)
+            early = fault.verify_code == _NOT_YET_VALID
+            clock = "; set the clock of this computer" if early else ""
             return f"expected the certificate of {self.caller.peer}: {fault.verify_message}{clock}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
         if (

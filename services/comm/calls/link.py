@@ -113,8 +113,8 @@ class Heartbeat:
 
     def advance(self, now: float) -> Beat:
         """Return what to do at `now`. Call it when `due`."""
-        # Time in which this process did not run is no silence of the other side: what that one sent
-        # may still be in the socket, and on the same host it may not have run either.
+        # Only time in which this process ran counts: what the other side sent meanwhile may still
+        # be in the socket, and on the same host it may not have run either.
         awake = min(now, self._due)
         if awake >= self.heard + self._timing.silence:
             if self._read_once:

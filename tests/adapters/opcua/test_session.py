@@ -125,7 +125,7 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
     assert driver.stopped() and driver.state()["faults"] == {}
     written = {"count": 7, "speed": 2, "sensor": True, "manner": "silent", "level": 3}
     assert done(driver, written) == ""
-    state = await_(driver, lambda s: s["values"] | written == s["values"], "the values")
+    await_(driver, lambda s: s["values"] | written == s["values"], "the values")
     # a value that does not fit its node is refused by name and type; the session continues
     assert "count: expected Int16" in done(driver, {"count": 70000})
     assert "count: expected Int16" in done(driver, {"count": "seven"})
