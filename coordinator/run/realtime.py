@@ -14,7 +14,7 @@ from typing import Final
 
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
-from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.client import KEY_CODES, Client
 from petrobot.services.comm.calls.peers import LEASED, OVERTAKEN
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
@@ -93,8 +93,6 @@ the leases of a coordinator that left without BYE (`services.comm.calls.callee.R
 TRANSIT: Final = 0.1
 """Longest time that a WELCOME needs on a busy host (s): an order right after the clearing of an
 emergency stop must not count as older. No operator gives and clears a stop in this time."""
-KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
-"""Refusals (docs/protocol.md) of a peer with another key than the node's."""
 
 
 class UnreachableError(Exception):

@@ -196,8 +196,10 @@ async def test_a_refused_caller_gets_the_reason_and_its_calls_end(
     open_node: Node, hello: m.Hello, key: bytes | None, cause: str, code: str
 ) -> None:
     """Without a key they end at once; with a key, an unproven refusal ends nothing, and the client
-    tries again."""
+    tries again. In both cases nobody waits for a connection until the time is over."""
     coordinator = open_node.client(hello, key=key)
+    async with asyncio.timeout(60.0):
+        assert not await coordinator.client.connected(10_000.0)
     outcome = await coordinator.client.call("echo")
     assert (outcome.cause, outcome.executed) == (cause, Executed.NO)
     assert code in outcome.text and ("unauthenticated refusal" in outcome.text) is (key is not None)
@@ -226,7 +228,12 @@ async def test_a_second_process_of_a_name_is_refused_and_a_newer_epoch_takes_ove
     second = open_node.client(m.Hello(2, 2, "coordinator", "coord", "c2", 1))
     outcome = await second.client.call("echo")
     assert "name_taken" in outcome.text
+    assert not await second.client.connected(0.3)
+    await first.client.close()  # it may end at any time: this one is waited for
+    assert await second.client.connected(60.0)
     await second.client.close()
+    first = open_node.client()
+    assert await first.client.connected(60.0)
     third = open_node.client(m.Hello(2, 2, "coordinator", "coord", "c3", 2))
     assert await third.client.connected(60.0)
     await first.notice(PeerLost)

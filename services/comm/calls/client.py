@@ -52,6 +52,10 @@ NOT_TRUSTED = (
 _FOR_GOOD = frozenset(("version", "key_needed", "wrong_node"))
 """Faults of the opening that another attempt does not cure. With a key, they are found only in a
 proven WELCOME."""
+KEY_CODES = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
+"""Refusals (docs/protocol.md) of a peer with another key."""
+_LASTING = _FOR_GOOD.union(KEY_CODES, ("directory", "old_epoch"))
+"""Refusals that stay until a person has changed something."""
 _EXPIRED = 10
 """X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
 _NOT_YET_VALID = 9
@@ -77,6 +81,8 @@ class _ClientLink(AsyncLink):
         self._client = client
         self.finished = asyncio.Event()
         self.refusal: Refuse | None = None
+        self.refused = ""
+        """Code of the refusal, also of one that is not proven."""
         self.welcome = False
 
     def made(self) -> None:
@@ -93,6 +99,7 @@ class _ClientLink(AsyncLink):
                 self.opened()
                 client.welcomed(now, self, message)
             elif isinstance(message, Refuse):
+                self.refused = message.code
                 if self.connection.proven:
                     self.refusal = message
                 else:
@@ -108,6 +115,7 @@ class _ClientLink(AsyncLink):
         return None
 
     def faulted(self, opening: bool, fault: ProtocolError) -> None:
+        self.refused = fault.code
         if opening and fault.code in _FOR_GOOD:
             self.refusal = Refuse(fault.code, fault.text)
 
@@ -166,6 +174,9 @@ class Client:
         self._behind = -math.inf
         self._flushing = False
         self._up = asyncio.Event()
+        self._decided = asyncio.Event()
+        """The peer has welcomed us, or has refused us twice in a row for a lasting reason."""
+        self._refusals = 0
         self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
 
     def start(self) -> None:
@@ -174,10 +185,11 @@ class Client:
         self._task = self._loop.create_task(self._connect_for_ever())
 
     async def connected(self, timeout: float) -> bool:
-        """Wait at most `timeout` seconds for the peer's WELCOME; return whether it came."""
+        """Wait at most `timeout` seconds for the peer's WELCOME, but not for a peer that goes on
+        refusing us; return whether it came."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
-                await self._up.wait()
+                await self._decided.wait()
         return self._up.is_set()
 
     @property
@@ -337,6 +349,7 @@ class Client:
         _log.log(level, "link to %s is up", self.caller.peer)
         self._link, self.trouble = link, ""
         self._up.set()
+        self._decided.set()
         self.caller.link_up(now, welcome)
 
     def gone(self, now: float, link: _ClientLink) -> None:
@@ -352,6 +365,10 @@ class Client:
         if self._link is link:
             self._link = None
         self._up.clear()
+        self._decided.clear()
+        self._refusals = self._refusals + 1 if link.refused in _LASTING else 0
+        if self._refusals > 1:
+            self._decided.set()
         if link.refusal is not None:
             self.caller.link_refused(now, link.refusal)
         else:
