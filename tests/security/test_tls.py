@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives import serialization
 
 from petrobot.coordinator.cli import main
 from petrobot.services.comm.calls.caller import Caller
@@ -202,6 +203,18 @@ def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> Non
         make_certificates(tmp_path, ["vision"])
 
 
+def give_password(key: Path) -> None:
+    """Protect a private key with a password."""
+    plain = serialization.load_pem_private_key(key.read_bytes(), None)
+    key.write_bytes(
+        plain.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.BestAvailableEncryption(b"secret"),
+        )
+    )
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -216,6 +229,7 @@ def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> Non
             "cannot use the certificate of vision",
         ),
         (lambda folder: (folder / "ca.pem").unlink(), "cannot use the certificate of vision"),
+        (lambda folder: give_password(folder / "vision.key"), "has a password"),
     ],
 )
 def test_bad_files_give_one_clear_error(

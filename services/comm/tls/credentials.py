@@ -114,7 +114,7 @@ class Credentials:
             context.load_verify_locations(ca)
             if self.also is not None:
                 context.load_verify_locations(self.also / CA_FILE)
-            context.load_cert_chain(certificate, key)
+            context.load_cert_chain(certificate, key, _no_password)
         except (OSError, ssl.SSLError) as fault:
             reason = (
                 getattr(fault, "strerror", "")
@@ -127,6 +127,12 @@ class Credentials:
             ) from None
         self.tell_ends()
         return context
+
+
+def _no_password() -> str:
+    """Refuse a key with a password: without this OpenSSL asks for it in the terminal, which a node
+    does not have and an emergency stop must not wait for."""
+    raise OSError(0, "its private key has a password: no node can type one")
 
 
 def credentials(directory: Directory, party: str) -> Credentials:
