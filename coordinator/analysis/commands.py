@@ -643,9 +643,10 @@ def gspn_of(
     *,
     measure: Measure | None,
     cell_of: CellOf | None,
-) -> tuple[NetFile, Mapping[str, str], str]:
-    """Return the GSPN of a task or net file, where each rate and weight comes from, by name, and
-    which cell is assumed (empty for a net file).
+) -> tuple[NetFile, Mapping[str, str], Mapping[str, str], str]:
+    """Return the GSPN of a task or net file, where each rate and weight comes from, by name, the
+    chains of phases in it (as `StochasticView` has them), and which cell is assumed (empty for a
+    net file).
 
     Raises NetFileError, NoEstimate and the errors of `load`.
     """
@@ -654,7 +655,8 @@ def gspn_of(
     known = _measured(model, measure, cell)
     if isinstance(model, Task):
         view = stochastic_view(model, known, devices=devices_of(cell))
-        return NetFile(view.gspn.net, model.name, view.gspn), view.sources, assumed(cell)
+        drawn = NetFile(view.gspn.net, model.name, view.gspn)
+        return drawn, view.sources, view.chains, assumed(cell)
     if model.gspn is None:
         raise NetFileError(str(path), "rates", "the file has none", "give a file with rates")
-    return model, dict.fromkeys(model.net.transitions, f"from {path.name}"), ""
+    return model, dict.fromkeys(model.net.transitions, f"from {path.name}"), {}, ""

@@ -152,7 +152,7 @@ def export(text: str, filename: str, form: str, cell: Fields) -> ConvertedTask:
             raise FormatError(f"no stochastic view: {fault}") from fault
         model = NetFile(view.gspn.net, task.name, view.gspn)
         return ConvertedTask(
-            gspn_svg(model, view.sources, task.name, assumed(known)), "image/svg+xml"
+            gspn_svg(model, view.sources, view.chains, task.name, assumed(known)), "image/svg+xml"
         )
     raise FormatError(f"no format {form!r}: toml, pnml and gspn.svg are known")
 

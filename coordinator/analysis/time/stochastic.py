@@ -223,6 +223,8 @@ class StochasticView:
     """Numbers that do not measure what the view takes them for."""
     comes: Mapping[str, str] = field(default_factory=dict)
     """By timed transition that only lets an event come: the event."""
+    chains: Mapping[str, str] = field(default_factory=dict)
+    """By place that is a phase: the chain of equal phases that it is in."""
 
     def projected(self, marking: Marking) -> Marking:
         """Return the marking of the ordinary net that a marking of the GSPN projects to."""
@@ -317,6 +319,7 @@ class _Derivation:
         self.sources: dict[str, str] = {}
         self.comes: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
+        self.chains: dict[str, str] = {}
         self.waiting: set[str] = set()
         """Places in which a run waits for its device."""
         self.raised: dict[str, tuple[str, ...]] = {}
@@ -403,6 +406,7 @@ class _Derivation:
             frozenset(self.spoils),
             tuple(self.doubts),
             self.comes,
+            self.chains,
         )
 
     # Transitions of the GSPN.
@@ -657,8 +661,10 @@ class _Derivation:
             key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
         )
         for i, branch in enumerate(duration.branches):
-            chain = [f"{end}.{action}{'abc'[i]}{k}" for k in range(1, branch.stages + 1)]
+            stem = f"{end}.{action}{'abc'[i]}"
+            chain = [f"{stem}{k}" for k in range(1, branch.stages + 1)]
             self.places |= dict.fromkeys(chain, 0)
+            self.chains |= dict.fromkeys(chain, stem)
             self.phases[name] += chain
             self._immediate(
                 f"{key} {i + 1}",
@@ -755,6 +761,7 @@ class _Derivation:
             stem = f"{place.name}.{status}.{number}{'abc'[j]}"
             chain = [f"{stem}{i}" for i in range(1, longest + 1)]
             self.places |= dict.fromkeys(chain, 0)
+            self.chains |= dict.fromkeys(chain, stem)
             self.phases[place.name] += chain
             self.held |= dict.fromkeys(chain if device else (), device)
             for i in range(1, longest):

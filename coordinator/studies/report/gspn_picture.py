@@ -1,36 +1,101 @@
 """The stochastic view as SVG: timed transitions are boxes, immediate ones bars, each with its rate
-or weight and where that comes from."""
+or weight and where that comes from. A duration is drawn as one place and one box."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.drawing import Caption, Overlay, draw
+from petrobot.coordinator.task.net import Net
 
 
-def gspn_svg(model: NetFile, sources: Mapping[str, str], title: str, assumed: str) -> str:
+def gspn_svg(
+    model: NetFile,
+    sources: Mapping[str, str],
+    chains: Mapping[str, str],
+    title: str,
+    assumed: str,
+) -> str:
     """Return the drawing of a net with rates. `sources`: where the number of a transition comes
-    from; `assumed`: which cell, empty for a net of another tool."""
+    from; `chains`: by place, the chain of phases that is drawn as one place; `assumed`: which cell,
+    empty for a net of another tool."""
+    assert model.gspn is not None
+    folded, names = folded_chains(model.gspn, chains)
     # In a GSPN of a task a place and a transition may have the same name; a drawing needs two.
-    renamed, _ = model.with_names(re.compile(".+", re.DOTALL))
-    gspn = renamed.gspn
-    assert gspn is not None
-    pairs = zip(gspn.net.transitions, model.net.transitions, strict=True)
+    renamed, _ = NetFile(folded.net, gspn=folded).with_names(re.compile(".+", re.DOTALL))
+    phases = Counter(chains.values())
     captions = {
-        name: _caption(gspn, t, old, sources.get(old, "")) for t, (name, old) in enumerate(pairs)
+        new: _caption(folded, t, sources.get(names[name], ""), phases)
+        for t, (new, name) in enumerate(
+            zip(renamed.net.transitions, folded.net.transitions, strict=True)
+        )
     }
     overlay = Overlay(legend=f"Assumed: {assumed}." if assumed else "")
     return draw(renamed.net, title=title, captions=captions, overlay=overlay)
 
 
-def _caption(gspn: Gspn, t: int, name: str, source: str) -> Caption:
+def folded_chains(gspn: Gspn, chains: Mapping[str, str]) -> tuple[Gspn, dict[str, str]]:
+    """Return the net to draw, in which each chain is one place, and by name of its transitions one
+    that it stands for.
+
+    A drawing needs neither the steps from phase to phase nor for each phase a transition that
+    removes it. Transitions by which a run enters one chain at different phases are one, too.
+    """
+    net = gspn.net
+    places = [chains.get(place, place) for place in net.places]
+    tokens = Counter[str]()
+    for place, n in zip(places, net.initial, strict=True):
+        tokens[place] += n
+    arcs: dict[str, tuple[dict[str, int], dict[str, int]]] = {}
+    inhibitors, priority = dict[str, dict[str, int]](), dict[str, int]()
+    rates, weights, servers = dict[str, float](), dict[str, float](), dict[str, int | None]()
+    same = dict[tuple[object, ...], tuple[str, int]]()
+    names: dict[str, str] = {}
+    for t, name in enumerate(net.transitions):
+        need, give, bars = (
+            {places[p]: n for p, n in arcs[t]} for arcs in (net.consume, net.produce, net.inhibit)
+        )
+        folds = [p for p, _ in (*net.consume[t], *net.produce[t]) if net.places[p] in chains]
+        if folds and need == give:
+            continue
+        drawn = name
+        for p in folds:
+            drawn = drawn.replace(net.places[p], places[p])
+        rate, weight = gspn.rate[t], gspn.weight[t]
+        if folds:
+            like = (*map(_key, (need, give, bars)), rate is None)
+            first, other = same.setdefault(like, (drawn, t))
+            if first != drawn or other != t:
+                if net.consume[other] == net.consume[t]:
+                    share = rates if rate is not None else weights
+                    share[first] += rate if rate is not None else weight
+                continue
+        arcs[drawn], inhibitors[drawn], names[drawn] = (need, give), bars, name
+        priority[drawn], servers[drawn] = net.priority[t], gspn.servers[t]
+        if rate is None:
+            weights[drawn] = weight
+        else:
+            rates[drawn] = rate
+    folded = Net.build(tokens, arcs, inhibitors=inhibitors, priority=priority)
+    return Gspn.of(folded, rates, weights=weights, servers=servers), names
+
+
+def _key(arcs: Mapping[str, int]) -> frozenset[tuple[str, int]]:
+    return frozenset(arcs.items())
+
+
+def _caption(gspn: Gspn, t: int, source: str, phases: Mapping[str, int]) -> Caption:
     """Return what the drawing says of a transition."""
-    rate, servers = gspn.rate[t], gspn.servers[t]
+    net, rate, servers = gspn.net, gspn.rate[t], gspn.servers[t]
+    name = net.transitions[t]
+    need, give = ({net.places[p] for p, _ in arcs[t]} for arcs in (net.consume, net.produce))
+    count = max((phases[place] for place in need - give if place in phases), default=1)
     if rate is not None:
-        said = f"{rate:.4g}/s"
+        said = f"{rate:.4g}/s" if count == 1 else f"{count} phases of {rate:.4g}/s"
         if servers != 1:
             said += " for each token" if servers is None else f", {servers} servers"
     else:
