@@ -139,6 +139,16 @@ def test_the_lost_trial_is_the_one_whose_token_is_lost() -> None:
     ]
 
 
+@pytest.mark.parametrize("end", ['final_error = "broken > 0"', ""])
+def test_the_trial_of_a_task_without_a_runs_place_is_lost_with_its_mission(end: str) -> None:
+    """It counts as not completed, whether the task gives up by `final_error` or gets stuck."""
+    text = PIPE.replace('runs_place = "rack"', "").replace('final_error = "broken > 0"', end)
+    task = loads(text, "pipe.toml")
+    (trial,), ends = played(task, 1, {"load": [run(0.5, ActionStatus.ERROR)]})
+    assert (trial.completed, trial.status, trial.cause) == (False, "error", "slipped")
+    assert [(end.goal, end.success) for end in ends] == [(False, False)]
+
+
 @pytest.mark.parametrize("lines", [
     {},
     {"move_to_point": [run(0.2, ActionStatus.ERROR), run(0.2), run(0.2)]},
