@@ -32,6 +32,8 @@ final = "rack == 0 and hand == 1"
 goal_transitions = ["weighed"]
 runs_place = "rack"
 final_error = "broken > 0"
+[task.parameters]
+regime = "A"
 [errors]
 to = "broken"
 [primitive_tasks]
@@ -121,6 +123,7 @@ def test_what_happens_to_a_token_is_told_to_its_trial() -> None:
     left = [trial.begun + (trial.time or 0.0) for trial in trials]
     assert left != sorted(left)  # the second part was ready before the first
     assert [(end.goal, end.success) for end in ends] == [(True, True)] * 12
+    assert {end.context for end in ends} == {"regime=A"}  # also of the first, which begins at once
 
 
 def test_the_lost_trial_is_the_one_whose_token_is_lost() -> None:
