@@ -39,7 +39,7 @@ from petrobot.coordinator.analysis.time.simulate import (
     goal_by_marking,
     simulate,
 )
-from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
@@ -416,7 +416,7 @@ def simulate_command(
             doubts = [*view.doubts]
             if horizon is None and seen.complete:
                 doubts += _unlike_the_engine(task, measured, devices_of(cell), seen, stages)
-            notes = (*(f"doubtful: {text}" for text in doubts), *notes)
+            notes = (*(f"doubtful: {text}" for text in doubts), *_rough(view, seen, stages), *notes)
         if not seen.complete:
             notes = (UNFINISHED, *notes)
         return _simulated(name or path.stem, seen, notes)
@@ -424,6 +424,27 @@ def simulate_command(
         return _refused(path, error)
     except OUT_OF_MEMORY:
         return full
+
+
+def _rough(view: StochasticView, seen: Simulation, stages: int) -> list[str]:
+    """Return, as a note, which durations have too few phases for quantiles of the time: error times
+    share of the time, as for the exact solution."""
+    phases = {f"{p}.{a}.{s}": f"{p}.{s}." for p, a, s in view.statuses.values()}
+    rough = {}
+    for key, error in view.fit_errors.items():
+        if key in phases:
+            tokens = [one for p, one in seen.mean_tokens.items() if p.startswith(phases[key])]
+            share = sum(one.mean for one in tokens)
+        elif ".by." in key:  # until the run is preempted
+            share = seen.mean_tokens[key.partition(".by.")[0].rpartition(".")[0]].mean
+        else:
+            timer = view.task.transitions[key.rpartition(".")[0]]
+            share = seen.throughput[timer.name].mean * (timer.after or 0.0)
+        if abs(error) * share >= MATTERS:
+            rough[key] = error
+    most = 100 * max(rough.values(), key=abs, default=0.0)
+    few = f"off by up to {most:+.0f} %, because a duration has at most {stages} phases"
+    return [f"approximated: the 90 % quantile of {', '.join(rough)} is {few}"] if rough else []
 
 
 def _unlike_the_engine(

@@ -50,6 +50,7 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
     from petrobot.coordinator.analysis.time.measured import NoEstimate
     from petrobot.coordinator.cli.analyse import bounded
     from petrobot.coordinator.launch import with_runs
+    from petrobot.coordinator.learning.objective import common_weight
     from petrobot.coordinator.learning.propagation import propagate
 
     task, _ = with_runs(load_task(name), 1)
@@ -57,9 +58,10 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
     known = {name: kept.estimates.of(name, context) for name in task.primitive_tasks}
     refuse_unknown_cost({name: of for name, of in known.items() if of}, options)
     asked = {name: asked_question(kept, name, options) for name in known}
+    rho = common_weight(asked.values())
     try:
         with bounded(name):
-            found = propagate(task, kept.estimates, context, questions=asked, rho=options.rho)
+            found = propagate(task, kept.estimates, context, questions=asked, rho=rho)
     except (NoEstimate, ValueError) as fault:
         raise CommandError(2, f"{task.name}: {fault}") from fault
     parts = [

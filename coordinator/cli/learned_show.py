@@ -74,13 +74,14 @@ def measured_task(
 ) -> dict[str, Any] | None:
     """Return R_conj, C and J of a whole task as its trials in the plant measured them, as plain
     data; None if the file has none. C is that of the costs by which the runs were judged."""
-    from petrobot.coordinator.learning.objective import compare, task_figures
+    from petrobot.coordinator.learning.objective import common_weight, compare, task_figures
 
     trials = kept.estimates.trials_of(name, options.context)
     asked = {p: kept.question(p) for sums in trials.values() for p in sums.runs}
     compared = {p: compare(kept.estimates.of(p, options.context), q) for p, q in asked.items()}
     measures = {p: q.measure for p, q in asked.items()}
-    found = task_figures(trials, measures, compared, options.rho)
+    rho = common_weight(asked.values()) if options.rho is None else options.rho
+    found = task_figures(trials, measures, compared, rho)
     if found is not None and options.cost not in (None, *measures.values()):
         found = replace(found, cost=None, rho=None, j=None)  # trials hold costs of one measure
     return None if found is None else found.to_plain()

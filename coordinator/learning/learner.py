@@ -27,7 +27,7 @@ from petrobot.coordinator.engine.instructions import (
     StartRun,
 )
 from petrobot.coordinator.engine.state import Phase
-from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
+from petrobot.coordinator.engine.stimuli import Begin, Chosen, RunEnded, Stimulus
 from petrobot.coordinator.learning.estimate import COUNT, Observation
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import (
@@ -230,7 +230,15 @@ class LearningSelector(FirstAlternative):
         """Remember the context of a choice, and what a run's result contains beside its status."""
         self._begin(now)
         self._waits.stimulus(now, stimulus)
-        if isinstance(stimulus, Chosen):
+        if isinstance(stimulus, Begin):  # its own firings have a context, too
+            point = {} if stimulus.point is None else stimulus.point.variables
+            self._values = {
+                **self.learning.task.initial_variables(),
+                **point,
+                **stimulus.parameters,
+                **stimulus.variables,
+            }
+        elif isinstance(stimulus, Chosen):
             self._choice(now, stimulus)
         elif isinstance(stimulus, RunEnded):
             self._run(now, stimulus.run).ended = stimulus

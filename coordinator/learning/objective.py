@@ -164,6 +164,13 @@ def cost_weight(costs: Iterable[float]) -> float:
     return 1.0 / largest if largest > 0 else 0.0
 
 
+def common_weight(questions: Iterable[Question]) -> float | None:
+    """Return the rho of a whole task: that of all these questions; None if they have none, or not
+    the same one."""
+    given = {question.rho for question in questions}
+    return given.pop() if len(given) == 1 else None
+
+
 def objective(reliability: float, cost: float, rho: float, availability: float = 1.0) -> float:
     """Return J = 1 - A R + rho C."""
     return 1.0 - availability * reliability + rho * cost

@@ -144,8 +144,11 @@ class TrialTokens:
 
     def lost(self, finished: Finished) -> set[int]:
         """Return the trials that a mission run has lost which ended in ERROR: those with a token
-        where `final_error` looks; if there are none, all that are not back."""
+        where `final_error` looks; if there are none, all that are not back. A task without a runs
+        place has lost its one trial."""
         if finished.status is Status.SUCCESS:
             return set()
+        if self._runs_place is None:  # its tokens are not followed
+            return {self.begun}
         fatal = {trial for place in self._fatal for trial in self._waiting[place]}
         return fatal or {t for t in range(1, self.begun + 1) if not self._has_all(t)}

@@ -789,6 +789,22 @@ def test_exits_that_read_another_run_are_judged_with_the_graph(
     assert answer.report.ok is (severity != "error")
 
 
+def test_a_dead_end_is_why_only_an_error_leads_to_the_end() -> None:
+    """Its cause is told once, and no advice about another one stands beside it."""
+    task = make_task(
+        "go=1 act! done lamp",
+        {
+            "begin": {"in": "go", "out": "act"},
+            "good": {"in": "act:normal lamp", "out": "done"},
+            "bad": {"in": "act:error", "out": "done"},
+        },
+        final="done == 1",
+    )
+    assert judged(task).deadlock_free.holds is False
+    found = may_run(task, None, Budget()).report.findings
+    assert not [f for f in found if f.code == "end-by-error"]
+
+
 @pytest.mark.parametrize("also", ["", " and waiting == 0"])
 def test_an_end_that_only_an_error_leads_to_is_a_warning(also: str) -> None:
     """The token that waits for the button is never gone before `nod` ends in ERROR."""

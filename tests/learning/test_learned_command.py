@@ -472,6 +472,12 @@ def test_r_and_c_of_the_whole_task(cell: Path, capsys: pytest.CaptureFixture[str
     mixed = {p["primitive_task"]: p["C"] for p in same["primitive_tasks"]}
     costs = [a["C"] for a in shown["place"]["actions"]]
     assert min(costs) <= mixed["place"] <= max(costs), "both commands must show the same costs"
+    # The rho by which a campaign judged every action is that of the whole task, too.
+    asked = {name: Question("wall", rho=0.25) for name in ("pick", "place")}
+    EstimatesFile(Path("learned.db")).add(Estimates({}), {}, asked=asked)
+    assert main([*one, "--cost", "wall"]) == 0
+    again = json.loads(Path("task.json").read_text(encoding="utf-8"))
+    assert (again["rho"], again["J"]) == (0.25, same["J"])
     assert main([*one, "--cost", "value:nothing"]) == 2
     assert main([*one, "--budget", "3"]) == 2
     capsys.readouterr()

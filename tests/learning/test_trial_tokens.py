@@ -32,6 +32,8 @@ final = "rack == 0 and hand == 1"
 goal_transitions = ["weighed"]
 runs_place = "rack"
 final_error = "broken > 0"
+[task.parameters]
+regime = "A"
 [errors]
 to = "broken"
 [primitive_tasks]
@@ -121,6 +123,7 @@ def test_what_happens_to_a_token_is_told_to_its_trial() -> None:
     left = [trial.begun + (trial.time or 0.0) for trial in trials]
     assert left != sorted(left)  # the second part was ready before the first
     assert [(end.goal, end.success) for end in ends] == [(True, True)] * 12
+    assert {end.context for end in ends} == {"regime=A"}  # also of the first, which begins at once
 
 
 def test_the_lost_trial_is_the_one_whose_token_is_lost() -> None:
@@ -137,6 +140,16 @@ def test_the_lost_trial_is_the_one_whose_token_is_lost() -> None:
         (False, False),
         *[(True, True)] * (len(trials) - 1),
     ]
+
+
+@pytest.mark.parametrize("end", ['final_error = "broken > 0"', ""])
+def test_the_trial_of_a_task_without_a_runs_place_is_lost_with_its_mission(end: str) -> None:
+    """It counts as not completed, whether the task gives up by `final_error` or gets stuck."""
+    text = PIPE.replace('runs_place = "rack"', "").replace('final_error = "broken > 0"', end)
+    task = loads(text, "pipe.toml")
+    (trial,), ends = played(task, 1, {"load": [run(0.5, ActionStatus.ERROR)]})
+    assert (trial.completed, trial.status, trial.cause) == (False, "error", "slipped")
+    assert [(end.goal, end.success) for end in ends] == [(False, False)]
 
 
 @pytest.mark.parametrize("lines", [

@@ -910,10 +910,13 @@ class Progress:
 
     @cached_property
     def ends_by_error(self) -> PropertyVerdict | None:
-        """How `final` is reached, if only after a run has ended in ERROR; else None."""
+        """How `final` is reached, if only after a run has ended in ERROR; else None. A dead end is
+        the reason, where there is one, and has a verdict of its own."""
         x = self.x
         regular = x.of_edges(~x.fails & ~x.by_hand)
         if not self._whole or not x.final.any() or regular.backward(x.final)[0]:
+            return None
+        if self.deadlock_free.holds is False:
             return None
         return self._no(
             "`final` is only reached after a run has ended in ERROR", int(np.argmax(x.final))
