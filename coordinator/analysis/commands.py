@@ -439,7 +439,8 @@ def _rough(view: StochasticView, seen: Simulation, stages: int) -> list[str]:
             share = seen.mean_tokens[key.partition(".by.")[0].rpartition(".")[0]].mean
         else:
             timer = view.task.transitions[key.rpartition(".")[0]]
-            share = seen.throughput[timer.name].mean * (timer.after or 0.0)
+            cases = [case for case, name in view.origin.items() if name == timer.name]
+            share = sum(seen.throughput[case].mean for case in cases) * (timer.after or 0.0)
         if abs(error) * share >= MATTERS:
             rough[key] = error
     most = 100 * max(rough.values(), key=abs, default=0.0)
