@@ -110,6 +110,19 @@ def test_a_load_does_not_keep_it_from_its_goal() -> None:
     assert arm.state()["q"] == pytest.approx(THERE["joints"], abs=0.006)
 
 
+def test_a_load_that_was_too_great_does_not_keep_it_from_its_next_goal() -> None:
+    """As of a hand that holds it back and lets it go."""
+    rig = Rig()
+    arm = rig.arm().ready()
+    rig.bus.servos[2].external = -0.65
+    arm.command(arm.ports.now, THERE)
+    arm.run(3.0)
+    assert not arm.state()["at_goal"] and not arm.state()["faults"]
+    rig.bus.servos[2].external = 0.0
+    arm.run(1.0)
+    assert arm.state()["at_goal"]
+
+
 @pytest.mark.parametrize(
     ("body", "words"),
     [
@@ -352,6 +365,17 @@ def test_trouble_stops_it_until_a_reset(kind: str) -> None:
     arm.command(arm.ports.now, BACK)
     arm.run(3.0)
     assert arm.state()["at_goal"]
+
+
+def test_an_overload_that_its_servo_reports_ends_with_one_reset() -> None:
+    """Its torque, written by `enable`, clears it there, but an older answer comes first."""
+    arm = (rig := Rig()).arm().ready()
+    rig.bus.servos[3].fault = 32
+    arm.run(0.1)
+    assert list(arm.state()["faults"]) == ["overload"]
+    arm.command(arm.ports.now, {"do": "enable"})
+    arm.run(0.3)
+    assert not arm.state()["faults"] and arm.state()["ready"]
 
 
 @pytest.mark.parametrize(("on_estop", "falls"), [("hold", False), ("off", True)])
