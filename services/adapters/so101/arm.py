@@ -430,7 +430,7 @@ class Arm(Driver):
         if self._hand == "close" and not self.paused:
             excess = -joint.load - self._grip
             if excess > 0.0 or joint.stands:  # it touches something
-                way = GIVE * excess * self.period
+                way = GIVE * excess * self.period * (1.0 if excess > 0.0 else self.speed)
                 jaw.halt([min(high, max(low, joint.aim + way))])
             elif not jaw.moving and jaw.q != [low]:
                 jaw.begin([[low]])

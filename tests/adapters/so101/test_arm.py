@@ -6,6 +6,7 @@ import math
 import random
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,19 @@ def test_its_duration_follows_from_speed_and_acceleration(keys: Any, seconds: fl
     fastest, rate = arm.top_speed * arm.speed, arm.acceleration
     due = 1.0 / fastest + fastest / rate if fastest**2 / rate < 1.0 else 2 * math.sqrt(1.0 / rate)
     assert arm.ports.now - begin == pytest.approx(due, abs=0.1) and due > 0.8 * seconds
+
+
+def test_its_gripper_closes_at_the_share_of_its_speed_too() -> None:
+    """Also at first, when it stands, as one that touches something does."""
+    rig = Rig(so101([0.0] * 5 + [1.0]))
+    arm = rig.arm(speed=0.1).ready()
+    arm.command(arm.ports.now, {"do": "close", "squeeze": 0.4})
+    ways = [rig.bus.servos[6].angle]
+    for _ in range(100):
+        arm.run(arm.period)
+        ways.append(rig.bus.servos[6].angle)
+    fastest = max(a - b for a, b in pairwise(ways)) / arm.period
+    assert 0.1 < fastest < 0.16
 
 
 def test_a_load_does_not_keep_it_from_its_goal() -> None:
