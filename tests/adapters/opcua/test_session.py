@@ -194,7 +194,13 @@ def test_a_handshake_and_its_errors(cell: Cell) -> None:
         if now == 0.4:
             driver.command(0.0, {"write": {"manner": "bad"}})
 
-    table = {"request": "count", "value": 1, "idle": 0, "acknowledge": "speed", "expect": 9.0}
+    table: dict[str, Any] = {
+        "request": "count",
+        "value": 1,
+        "idle": 0,
+        "acknowledge": "speed",
+        "expect": 9.0,
+    }
     found = rehearse(handshake, device=driver, world=spoil, limit=20.0, timeout=1.0, **table)
     assert found.result.cause == "not_acknowledged" and "BadSensor" in found.result.text
     assert done(driver, {"manner": "silent"}) == ""

@@ -505,7 +505,7 @@ def test_the_workspace_bounds_goals_and_stops_what_leaves_it() -> None:
         robot(workspace=box)
     bridge, link = robot(workspace=box, subscribe={"odom": ODOMETRY})
     for spelling in ("nav2_msgs/action/NavigateToPose", "nav2_msgs/NavigateToPose"):
-        beyond = {"x": 2.0, "y": 0.0, "action": "/ok", "action_type": spelling}
+        beyond: dict[str, Any] = {"x": 2.0, "y": 0.0, "action": "/ok", "action_type": spelling}
         out = rehearse(actions.navigate_to_pose, device=bridge, **beyond).result
         assert said(out) == ("error", "bad_goal", "no") and "outside the workspace" in out.text
     assert not [m for m in link.fake.log if m["op"] == "send_action_goal"]
