@@ -15,6 +15,10 @@ QUALITY = 75
 """Quality of the JPEGs for the operator (0 to 100)."""
 
 
+LATEST = 10.0
+"""Seconds after which `take` must have an image exposed since it began."""
+
+
 class CameraError(ValueError):
     """The camera's table or its images cannot be used; the message says what to change."""
 
@@ -60,14 +64,19 @@ class CameraDriver(Driver):
     # For actions
 
     async def take(self, ctx: Context[Any], count: int = 1, timeout: float = 1.0) -> list[Image]:
-        """Return `count` images exposed from now on, or fewer if one does not come within `timeout`
-        s. Otherwise as `start` and `read`."""
+        """Return `count` images exposed from now on, or fewer if none comes for `timeout` s.
+        Otherwise as `start` and `read`."""
         taken = list[Image]()
         self.end()
         self.start()
+        begun = ctx.now
         try:
             while len(taken) < count and (image := await self.read(ctx, timeout)) is not None:
-                taken.append(image)
+                if image.time >= begun:
+                    taken.append(image)
+                elif ctx.now > begun + LATEST:
+                    text = f"image {image.sequence} was exposed {ctx.now - image.time:.1f} s ago"
+                    raise CameraError(f"camera: {text}; expected at most {LATEST:g} s")
         finally:
             self.end()
         return taken
@@ -91,11 +100,17 @@ class CameraDriver(Driver):
 
     async def read(self, ctx: Context[Any], timeout: float) -> Image | None:
         """Return the newest image that was not read yet, None when none arrives for `timeout` s.
-        Raises CameraError for an image of another size."""
+        Raises CameraError for an image of another size, or one whose pixels are not bytes."""
         await ctx.wait(self._arrived, timeout)
         image, self._newest = self._newest, None
         if image is None:
             return None
+        kind = str(getattr(image.pixels, "dtype", type(image.pixels).__name__))
+        if kind != "uint8":
+            raise CameraError(
+                f"camera: expected pixels of type uint8, found {kind}: convert them in "
+                f"{self.source}"
+            )
         if self.shape and image.pixels.shape != self.shape:
             raise CameraError(
                 f"camera: expected images of {_size(self.shape)}, found "

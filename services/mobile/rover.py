@@ -367,7 +367,7 @@ class Rover(Driver):
             (speed - turning * half) / wheels.wheel_radius,
             (speed + turning * half) / wheels.wheel_radius,
         )
-        most = max(abs(left), abs(right)) / (DRIVES_SHARE * wheels.top_speed)
+        most = max(abs(left), abs(right)) / (DRIVES_SHARE * wheels.top_speed * self.speed)
         if most > 1.0:
             left, right = left / most, right / most
         before, self._set = self._set, (left, right)

@@ -71,6 +71,9 @@ def test_at_a_quarter_of_its_speed_it_drives_a_quarter_as_fast() -> None:
     follow = {"do": "follow", "speed": 0.4}
     usual, slow = (fastest(enabled(yard_with(speed=s)), follow, 1.5) for s in (1.0, 0.25))
     assert slow == pytest.approx(0.25 * usual, rel=0.15)
+    wish = {"do": "follow", "speed": 9.0}  # far above what the rover can do
+    top = 1.2  # m/s, of its wheels
+    assert 0.2 * top < fastest(enabled(yard_with(speed=0.25)), wish, 1.5) < 0.27 * top
 
 
 def test_it_stands_before_it_leaves_its_workspace_and_goes_no_further() -> None:

@@ -3,6 +3,8 @@ refused with the remedy, and the operator sees the last one."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import repeat
 from typing import Any, cast
 
 import cv2
@@ -22,6 +24,8 @@ class Source:
     def __init__(self) -> None:
         self.shape: tuple[int, ...] = SHAPE
         self.condition, self.rates, self.count = "", list[float](), 0
+        self.kind: Any = np.uint8
+        self.times: Iterator[float] = repeat(0.5)
 
     def start(self, rate: float) -> None:
         if self.condition:
@@ -38,7 +42,8 @@ class Source:
         if self.condition or not self.rates or self.rates[-1] <= 0.0:
             return None
         self.count += 1
-        return Image(np.full(self.shape, self.count, np.uint8), 0.5, self.count)
+        pixels = np.full(self.shape, self.count, self.kind) if self.kind else cast(Any, None)
+        return Image(pixels, next(self.times), self.count)
 
 
 class Eye(CameraDriver):
@@ -75,11 +80,20 @@ def test_images_come_only_while_they_are_taken() -> None:
     assert source.rates[-1] == -1.0
 
 
+def test_an_image_exposed_before_is_not_taken() -> None:
+    """As the first one of a camera whose images come late: the arm may still have moved then."""
+    source = Source()
+    source.times = iter((-0.2, -0.01, 0.1, 0.2))
+    assert rehearse(look, device=eye(source)).result.values == {"shown": [3, 4]}
+
+
 @pytest.mark.parametrize(
     ("trouble", "text"),
     [
         ({"shape": (24, 32)}, "expected images of 64x48, found 32x24; change [camera] of eye.toml"),
         ({"shape": (48, 64, 3)}, "expected images of 64x48, found 64x48x3"),
+        ({"kind": np.uint16}, "expected pixels of type uint8, found uint16: convert them in sim"),
+        ({"kind": None}, "expected pixels of type uint8, found NoneType"),
         ({"condition": "camera 'x' was lost"}, "was lost"),
     ],
 )
@@ -91,7 +105,7 @@ def test_what_is_wrong_with_the_images_is_said(trouble: dict[str, Any], text: st
     found = rehearse(look, device=camera).result
     assert found.cause == "no_image" and text in found.text, found
     assert camera.stopped() and (not source.rates or source.rates[-1] == 0.0)
-    source.shape, source.condition = SHAPE, ""
+    source.shape, source.condition, source.kind = SHAPE, "", np.uint8
     assert rehearse(look, device=camera).result.status == "success"
 
 

@@ -73,7 +73,8 @@ async def handshake(
     if result.cause:
         return result
     if not seen:
-        return error("not_acknowledged", f"{acknowledge} did not become {expect!r}")
+        why = device.state["faults"].get(acknowledge, f"it did not become {expect!r}")
+        return error("not_acknowledged", f"{acknowledge}: {why}")
 
     def withdrawn() -> bool:
         return acknowledge in device.state["values"] and not acknowledged()

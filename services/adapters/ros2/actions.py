@@ -328,7 +328,8 @@ def _failed(end: Message, late: str, service: bool) -> Result:
     if phase == ExchangePhase.REJECTED and not service:
         return _not_executed("rejected", text)
     if phase == ExchangePhase.LOST:
-        said = "the connection to rosbridge broke; nobody knows whether it was executed"
+        said = "the connection to rosbridge broke" + (f" ({text})" if text else "")
+        said += "; nobody knows whether it was executed"
         return replace(error("link_lost", said), executed="unknown")
     if phase == ExchangePhase.UNANSWERED or phase in RUNNING:
         said = f"no result within {late}" if late else "it was given up"

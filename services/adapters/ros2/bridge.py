@@ -254,11 +254,12 @@ class Exchanges:
         if "action" in one.request:
             self.orphans[one.request["id"]] = one
 
-    def link(self, now: float, up: bool) -> list[Message]:
-        """Note that the link was made or lost; return the messages to send."""
+    def link(self, now: float, up: bool, why: str = "") -> list[Message]:
+        """Note that the link was made or lost (`why`); return the messages to send."""
         for one in self.open.values():
             if one.phase in RUNNING and not up:
                 self._abandon(one, ExchangePhase.LOST)
+                one.text = why
         for one in self.orphans.values():
             one.heard, one.asked = (now, -math.inf) if up else (-math.inf, math.inf)
         return self.advance(now)
@@ -380,7 +381,7 @@ class Bridge(TopicDriver):
                 self.advertised.clear()
                 self.topics.clear()  # values from before the link was lost
                 self.fragments = Fragments()
-                self.exchanges.link(now, False)
+                self.exchanges.link(now, False, words(item)[:500])
             elif fault := item if kind == "refused" else self._receive(now, item):
                 self.refuse(fault)
         self._send(self.exchanges.advance(now))

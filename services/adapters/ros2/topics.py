@@ -24,6 +24,9 @@ POINTS = {
     "nav_msgs/msg/Odometry": "pose.pose.position",
 }
 """By type: path of the point that `workspace` bounds."""
+SHARE = "scaling_factor"
+"""End of the path of a share: MoveIt moves at its own default speed for one that is not above 0 and
+at most 1."""
 TOPICS = 100_000
 """Characters of all kept topic messages together: they are published each cycle."""
 
@@ -130,21 +133,27 @@ class TopicDriver(Driver):
             slow = dict[str, float]()
             for path in self.speeds[interface]:
                 with contextlib.suppress(ValueError):  # what is not given is 0
-                    slow[path] = self.speed * float(pick(message, path))
+                    slow[path] = float(pick(message, path))
             if self.speeds[interface] and not slow:
                 wanted = " or ".join(self.speeds[interface])
                 raise ValueError(f"speed = {self.speed:g}: expected {wanted}")
-            message = filled(message, slow)
+            for path, value in slow.items():
+                if path.endswith(SHARE) and not 0.0 < value <= 1.0:
+                    wrong = f"expected a share above 0 and at most 1, found {value:g}"
+                    raise ValueError(f"speed = {self.speed:g}: {path}: {wrong}")
+            message = filled(message, {path: self.speed * value for path, value in slow.items()})
         if outside := self._outside(message, interface):
             raise ValueError(outside)
         return message
 
     def _outside(self, message: Message, interface: str) -> str:
         """Return in words that the point of a message lies outside the workspace, or is none."""
-        if interface not in self.points or not self.workspace.bounds:
+        short = _short(interface)
+        path = next((path for name, path in self.points.items() if _short(name) == short), "")
+        if not path or not self.workspace.bounds:
             return ""
         try:
-            at = pick(message, self.points[interface])
+            at = pick(message, path)
             return self.workspace.outside([float(at.get(axis, 0.0)) for axis in "xyz"])
         except (ValueError, TypeError, AttributeError) as fault:
             return f"{interface}: {fault}"
@@ -231,6 +240,11 @@ class TopicDriver(Driver):
 
 def _row(fields: Sequence[str], values: Sequence[float]) -> Message:
     return filled({}, dict(zip(fields, values, strict=True)))
+
+
+def _short(interface: str) -> str:
+    """Return the name of a type without its kind: rosbridge also takes "nav_msgs/Odometry"."""
+    return "/".join((interface.split("/")[0], interface.split("/")[-1]))
 
 
 def _unknown_speed(interface: str) -> str:

@@ -352,8 +352,10 @@ class Arm(Driver):
                 at = joint.steps(joint.aim)
                 read = read._replace(torque=True, goal=at, position=at, speed=0, load=0.0)
             joint.take(now, read)
+            # Errors from before `enable` are cleared when torque is written, in this period.
+            starts = self._on and joint.usable and not joint.started
             for bit, word in bus.ERRORS.items():
-                if answer.error & bit:
+                if answer.error & bit and not starts:
                     self._fault(word, f"the servo of {joint.name} reports {word}")
             if read.mode:
                 text = f"the servo of {joint.name} is in mode {read.mode}: it must be 0 (position)"
@@ -418,7 +420,8 @@ class Arm(Driver):
         """Whether its load keeps a joint from its goal, and its set point is still being moved."""
         if joint is self.gripper or not self.motion.arrived:
             return False
-        return abs(joint.aim - joint.q) > DEAD and abs(joint.trim) < 0.1
+        error = joint.aim - joint.q
+        return abs(error) > DEAD and math.copysign(joint.trim, joint.trim * error) < 0.1
 
     def _squeeze(self) -> None:
         """Close the gripper as long as its load is below the wish; see whether it holds."""
@@ -427,7 +430,7 @@ class Arm(Driver):
         if self._hand == "close" and not self.paused:
             excess = -joint.load - self._grip
             if excess > 0.0 or joint.stands:  # it touches something
-                way = GIVE * excess * self.period
+                way = GIVE * excess * self.period * (1.0 if excess > 0.0 else self.speed)
                 jaw.halt([min(high, max(low, joint.aim + way))])
             elif not jaw.moving and jaw.q != [low]:
                 jaw.begin([[low]])

@@ -140,6 +140,8 @@ class Arm(Driver):
         )
         self._seen = self._echoed = -math.inf
         self._count, self._echo, self._beat, self._ask_at = 0, -1, 0, 0.0
+        self._measured: Sequence[float] = (0.0,) * 6
+        """Joint angles last received (rad), also without a connection."""
         self._wanted = self._enabled = self._quick = False
         self._fault = self._reason = ""
         self._unseen_until, self._now = -math.inf, 0.0
@@ -204,6 +206,7 @@ class Arm(Driver):
             self._link.drop(now, str(fault))
         if self._rtde.count != self._count and self._link.up:
             self._count, self._seen = self._rtde.count, now
+            self._measured = self._rtde.data["actual_q"]
             echo = self._rtde.data["output_int_register_24"]
             if echo != self._echo and 0 <= self._beat - echo < 100 and self._count > 1:
                 self._echoed = now  # the program has read the set point sent just before
@@ -227,9 +230,12 @@ class Arm(Driver):
             self._enabled, self._reason = True, ""
             self._motion.halt(data["actual_q"])
         elif self._wanted and not ready:
-            trouble = self._dashboard.why or self._program.why
+            lacks = "its program does not run" if powered else "its drives are off"
+            if safety not in MAY_MOVE:
+                lacks = f"the controller reports {SAFETY.get(safety, 'a fault')}"
+            lacks = self._dashboard.why or self._program.why or f"{lacks}; is it in remote control?"
             waits = "no connection: " + (self._link.why or "no data yet")
-            self._reason = f"enabling {trouble}".rstrip() if fresh else waits
+            self._reason = f"enabling: {lacks}" if fresh else waits
             if fresh and now >= self._ask_at and not self.dry_run:
                 self._ask_at = now + ASK_AGAIN
                 self._ask(now, safety, data["robot_mode"])
@@ -268,7 +274,7 @@ class Arm(Driver):
 
     def _q(self) -> list[float]:
         pretends = self.dry_run and self._enabled
-        return list(self._motion.q if pretends else self._rtde.data.get("actual_q", (0.0,) * 6))
+        return list(self._motion.q if pretends else self._measured)
 
     def state(self) -> Mapping[str, Any]:
         """Return what actions, operator and report see; docs/robots/ur.md explains the keys."""

@@ -189,6 +189,22 @@ def test_a_handshake_and_its_errors(cell: Cell) -> None:
     assert done(driver, {"manner": "silent", "done": False}) == ""
     await_(driver, lambda state: state["values"]["done"] is False, "done = False")
 
+    def spoil(now: float) -> None:
+        pace(now)
+        if now == 0.4:
+            driver.command(0.0, {"write": {"manner": "bad"}})
+
+    table: dict[str, Any] = {
+        "request": "count",
+        "value": 1,
+        "idle": 0,
+        "acknowledge": "speed",
+        "expect": 9.0,
+    }
+    found = rehearse(handshake, device=driver, world=spoil, limit=20.0, timeout=1.0, **table)
+    assert found.result.cause == "not_acknowledged" and "BadSensor" in found.result.text
+    assert done(driver, {"manner": "silent"}) == ""
+
     def pull(now: float) -> None:
         pace(now)
         if now == 0.4:

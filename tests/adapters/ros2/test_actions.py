@@ -209,6 +209,7 @@ def test_a_link_lost_at_any_moment(at: float) -> None:
         assert said(result) == ("error", "link_down", "no")
         return
     assert said(result) == ("error", "link_lost", "unknown") and not bridge.stopped()
+    assert "(pulled)" in result.text
     link.mend()
     for tick in range(5):
         bridge.step(60.0 + tick)
@@ -470,6 +471,14 @@ def test_speed_slows_goals_and_set_points() -> None:
     ("options", "wrong"),
     [
         ({"goal": {"x": 1.0}}, "expected request.max_velocity_scaling_factor"),
+        (  # MoveIt takes both for its default
+            {"goal": {"request": {"max_velocity_scaling_factor": 0.0}}},
+            "scaling_factor: expected a share above 0 and at most 1, found 0",
+        ),
+        (
+            {"goal": {"request": {"max_velocity_scaling_factor": 8.0}}},
+            "scaling_factor: expected a share above 0 and at most 1, found 8",
+        ),
         ({"goal": MOVE_GROUP, "action_type": "a/action/B"}, 'write speeds = { "a/action/B" ='),
     ],
 )
@@ -495,8 +504,10 @@ def test_the_workspace_bounds_goals_and_stops_what_leaves_it() -> None:
     with pytest.raises(ValueError, match="nothing tells where the robot is"):
         robot(workspace=box)
     bridge, link = robot(workspace=box, subscribe={"odom": ODOMETRY})
-    out = rehearse(actions.navigate_to_pose, device=bridge, x=2.0, y=0.0, action="/ok").result
-    assert said(out) == ("error", "bad_goal", "no") and "outside the workspace" in out.text
+    for spelling in ("nav2_msgs/action/NavigateToPose", "nav2_msgs/NavigateToPose"):
+        beyond: dict[str, Any] = {"x": 2.0, "y": 0.0, "action": "/ok", "action_type": spelling}
+        out = rehearse(actions.navigate_to_pose, device=bridge, **beyond).result
+        assert said(out) == ("error", "bad_goal", "no") and "outside the workspace" in out.text
     assert not [m for m in link.fake.log if m["op"] == "send_action_goal"]
 
     def world(now: float) -> None:

@@ -6,6 +6,7 @@ import math
 import random
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,19 @@ def test_its_duration_follows_from_speed_and_acceleration(keys: Any, seconds: fl
     assert arm.ports.now - begin == pytest.approx(due, abs=0.1) and due > 0.8 * seconds
 
 
+def test_its_gripper_closes_at_the_share_of_its_speed_too() -> None:
+    """Also at first, when it stands, as one that touches something does."""
+    rig = Rig(so101([0.0] * 5 + [1.0]))
+    arm = rig.arm(speed=0.1).ready()
+    arm.command(arm.ports.now, {"do": "close", "squeeze": 0.4})
+    ways = [rig.bus.servos[6].angle]
+    for _ in range(100):
+        arm.run(arm.period)
+        ways.append(rig.bus.servos[6].angle)
+    fastest = max(a - b for a, b in pairwise(ways)) / arm.period
+    assert 0.1 < fastest < 0.16
+
+
 def test_a_load_does_not_keep_it_from_its_goal() -> None:
     rig = Rig()
     arm = rig.arm().ready()
@@ -108,6 +122,19 @@ def test_a_load_does_not_keep_it_from_its_goal() -> None:
     arm.run(3.0)
     assert arm.state()["at_goal"]
     assert arm.state()["q"] == pytest.approx(THERE["joints"], abs=0.006)
+
+
+def test_a_load_that_was_too_great_does_not_keep_it_from_its_next_goal() -> None:
+    """As of a hand that holds it back and lets it go."""
+    rig = Rig()
+    arm = rig.arm().ready()
+    rig.bus.servos[2].external = -0.65
+    arm.command(arm.ports.now, THERE)
+    arm.run(3.0)
+    assert not arm.state()["at_goal"] and not arm.state()["faults"]
+    rig.bus.servos[2].external = 0.0
+    arm.run(1.0)
+    assert arm.state()["at_goal"]
 
 
 @pytest.mark.parametrize(
@@ -352,6 +379,17 @@ def test_trouble_stops_it_until_a_reset(kind: str) -> None:
     arm.command(arm.ports.now, BACK)
     arm.run(3.0)
     assert arm.state()["at_goal"]
+
+
+def test_an_overload_that_its_servo_reports_ends_with_one_reset() -> None:
+    """Its torque, written by `enable`, clears it there, but an older answer comes first."""
+    arm = (rig := Rig()).arm().ready()
+    rig.bus.servos[3].fault = 32
+    arm.run(0.1)
+    assert list(arm.state()["faults"]) == ["overload"]
+    arm.command(arm.ports.now, {"do": "enable"})
+    arm.run(0.3)
+    assert not arm.state()["faults"] and arm.state()["ready"]
 
 
 @pytest.mark.parametrize(("on_estop", "falls"), [("hold", False), ("off", True)])

@@ -128,6 +128,31 @@ def test_nothing_moves_before_it_is_enabled() -> None:
     assert not cell.controller.program and cell.controller.robot_mode != RUNNING
 
 
+def test_why_it_is_not_enabled_yet_is_said() -> None:
+    cell = Cell()
+    cell.arm.command(cell.now, ENABLE)
+    cell.run(0.1)
+    said = "enabling: its drives are off; is it in remote control?"
+    assert cell.arm.state()["reason"] == said
+    cell.controller.robot_mode = RUNNING
+    cell.run(2 * cell.arm.period)
+    assert "its program does not run" in cell.arm.state()["reason"]
+    cell.controller.protective_stop()
+    cell.run(2 * cell.arm.period)
+    assert "the controller reports protective_stop" in cell.arm.state()["reason"]
+
+
+def test_without_a_connection_it_tells_where_it_was() -> None:
+    cell = Cell().enabled()
+    assert cell.go(joints=THERE)
+    ports = cast(UrPorts, cell.arm.ports)
+    ports.cable(False)
+    cell.run(3.0)
+    ports.cable(True)
+    cell.run(1.0, lambda: not cell.arm.state()["connected"] and len(ports.lines) > 3)
+    assert cell.arm.state()["q"] == pytest.approx(THERE, abs=0.003)
+
+
 def test_it_moves_as_fast_as_it_may_and_no_faster() -> None:
     cell = Cell(top_speed=0.8).enabled()
     cell.arm.command(cell.now, {"do": "move", "joints": THERE, "speed": 0.5})
