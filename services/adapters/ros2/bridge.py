@@ -280,6 +280,8 @@ class Exchanges:
         """Process feedback, a result, a response, or rosbridge's report that an operation failed;
         return why it cannot be used, "" if it can."""
         op, said, status = message["op"], message.get("values"), message.get("status")
+        if status is None and "status" in message:
+            status = "null"  # no older rosbridge, which gives none, and no success
         identity = given if isinstance(given := message.get("id"), str) else ""
         failed = op == "status" and message.get("level") == "error"
         if op not in ANSWERS:

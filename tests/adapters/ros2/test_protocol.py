@@ -248,6 +248,7 @@ def test_ids_are_globally_unique() -> None:
         ({"op": "status", "level": "warning", "msg": "slow"}, ExchangePhase.PENDING, ""),
         ({"op": "action_result", "status": 6, "result": False}, ExchangePhase.ABORTED, "status 6"),
         ({"op": "action_result", "status": 2, "result": True}, ExchangePhase.ABORTED, "status 2"),
+        ({"op": "action_result", "status": None, "result": True}, ExchangePhase.ABORTED, "null"),
         ({"op": "action_result", "result": True, "values": {}}, ExchangePhase.SUCCEEDED, ""),
         ({"op": "action_result", "result": False}, ExchangePhase.REJECTED, "no reason"),
         ({"op": "action_result", "status": [], "result": True}, ExchangePhase.ABORTED, "status"),
