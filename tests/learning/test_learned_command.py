@@ -458,6 +458,7 @@ def test_r_and_c_of_the_whole_task(cell: Path, capsys: pytest.CaptureFixture[str
     assert seen["trials"] == 30 and seen["R_conj"] == pytest.approx(found["R_conj"], abs=0.1)
     assert seen["R_conj_interval"][0] < seen["R_conj"] < seen["R_conj_interval"][1]
     assert seen["C"] is None and "measured: 30 trials of the task" in told
+    assert "these trials do not tell C and J of this cost" in " ".join(told.split())
     assert main(["learned", "show", "learned.db", "--json", "shown.json"]) == 0
     shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))
     assert shown["tasks"] == {"sorting": seen}
