@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from petrobot.coordinator.engine import Abort, Engine, Fired, Instruction, State, Stimulus
+from petrobot.coordinator.engine import Abort, Engine, Fired, Instruction, Report, State, Stimulus
+from petrobot.coordinator.engine.firing import DEAD_END
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import Envelope
@@ -23,6 +24,8 @@ class _Waiting:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self.since: float | None = None
+        self.dead = False
+        """Whether no event can end the wait."""
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """A firing of the task itself begins a new wait."""
@@ -31,6 +34,10 @@ class _Waiting:
             and instruction.transition in self._engine.compiled.advancing
         ):
             self.since = None
+        if isinstance(instruction, Fired):
+            self.dead = False
+        elif isinstance(instruction, Report) and instruction.key == DEAD_END:
+            self.dead = True
 
     def settled(self, now: float, state: State) -> None:
         """Begin or end a wait."""
@@ -52,7 +59,8 @@ class CoordinatorParty:
     recorded run is continued).
 
     A mission run that waits for an event longer than `PATIENCE`, and twice the period of each timer
-    of the location file, is aborted, unless it is `attended`: an operator may raise the event.
+    of the location file, or that no event can continue, is aborted, unless it is `attended`: an
+    operator may raise the event, or add tokens.
     """
 
     def __init__(
@@ -108,7 +116,8 @@ class CoordinatorParty:
                 caller.due()  # keeps `soonest` up to date
             if caller.has_news:
                 mission.take(now, node, caller.notices())
-        if self._waiting.since is not None and now >= self._waiting.since + self._patience:
+        since = self._waiting.since
+        if since is not None and (self._waiting.dead or now >= since + self._patience):
             self._give_up(now)
         mission.advance(now)
         if mission.stage is Stage.CONNECTING and all(
@@ -121,11 +130,10 @@ class CoordinatorParty:
     def _give_up(self, now: float) -> None:
         executor = self.mission.executor
         if not self.attended:
-            text = (
-                f"waited {self._patience:.0f} s of simulated time, and no operator can act: "
-                f"{executor.engine.waiting_for(executor.state)}"
-            )
-            executor.stimulate(now, Abort(text))
+            waited = f"waited {self._patience:.0f} s of simulated time"
+            why = "nothing can happen any more" if self._waiting.dead else waited
+            missing = executor.engine.waiting_for(executor.state)
+            executor.stimulate(now, Abort(f"{why}, and no operator can act: {missing}"))
         self._waiting.since = None
 
     def drain(self) -> Sequence[Envelope]:

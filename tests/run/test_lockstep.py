@@ -46,6 +46,16 @@ BUTTON = 'part = { in = ["todo"], out = ["count"], event = "button" }'
 TICKED = 'part = { in = ["todo"], out = ["count"], event = "tick" }'
 SLOW = '[timers.tick]\nnode = "node"\nperiod = 35.0\n'
 PATIENCE = 20.0
+LOST = 'lost = { in = ["count:error"], out = ["key"] }'
+FULL = (
+    TASK.replace(PART, 'part = { in = ["todo"], out = ["count"] }')
+    .replace("counted = {", "counted = { capacity = 1,")
+    .replace("todo = { tokens = 1 }", "todo = { tokens = 2 }")
+    .replace("counted == 1", "counted == 2")
+    .replace("listening = { tokens = 1,", "listening = {")
+    .replace('lost = { in = ["count:error"], out = ["counted"] }', LOST)
+)
+"""The second part finds no room, and its run has not ended in error. No button is looked for."""
 NEVER = "aborted: waited 20 s of simulated time, and no operator can act: "
 
 
@@ -87,10 +97,19 @@ def test_a_run_that_waits_for_an_event_without_an_operator_ends(
     assert PATIENCE <= now < PATIENCE + 4.0
 
 
+def test_a_run_that_no_event_can_continue_ends_at_once() -> None:
+    """Its campaign would simulate half an hour for each such trial."""
+    end, now = led(FULL)
+    assert end is not None and end.status is Status.ERROR
+    assert end.reason.startswith("aborted: nothing can happen any more, and no"), end.reason
+    assert "counted (capacity 1), which holds 1" in end.reason and now < PATIENCE / 2
+
+
 def test_with_an_operator_it_waits() -> None:
-    """The operator may still raise the event."""
-    end, _ = led(TASK, attended=True)
-    assert end is None
+    """The operator may still raise the event, or add a token."""
+    for text in (TASK, FULL):
+        end, _ = led(text, attended=True)
+        assert end is None
 
 
 def test_it_waits_for_the_timers_of_the_location_file() -> None:
