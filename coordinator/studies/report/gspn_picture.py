@@ -57,7 +57,7 @@ def folded_chains(gspn: Gspn, chains: Mapping[str, str]) -> tuple[Gspn, dict[str
     names: dict[str, str] = {}
     for t, name in enumerate(net.transitions):
         need, give, bars = (
-            {places[p]: n for p, n in arcs[t]} for arcs in (net.consume, net.produce, net.inhibit)
+            {places[p]: n for p, n in of[t]} for of in (net.consume, net.produce, net.inhibit)
         )
         folds = [p for p, _ in (*net.consume[t], *net.produce[t]) if net.places[p] in chains]
         if folds and need == give:
@@ -65,11 +65,12 @@ def folded_chains(gspn: Gspn, chains: Mapping[str, str]) -> tuple[Gspn, dict[str
         drawn = name
         for p in folds:
             drawn = drawn.replace(net.places[p], places[p])
+        drawn = name if drawn in arcs else drawn
         rate, weight = gspn.rate[t], gspn.weight[t]
         if folds:
             like = (*map(_key, (need, give, bars)), rate is None)
             first, other = same.setdefault(like, (drawn, t))
-            if first != drawn or other != t:
+            if other != t:
                 if net.consume[other] == net.consume[t]:
                     share = rates if rate is not None else weights
                     share[first] += rate if rate is not None else weight

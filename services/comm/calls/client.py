@@ -185,7 +185,7 @@ class Client:
         self._task = self._loop.create_task(self._connect_for_ever())
 
     async def connected(self, timeout: float) -> bool:
-        """Wait at most `timeout` seconds for the peer's WELCOME, but not for a peer that goes on
+        """Wait at most `timeout` seconds for the peer's WELCOME, but not for a peer that keeps
         refusing us; return whether it came."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
