@@ -665,10 +665,9 @@ def gspn_of(
     *,
     measure: Measure | None,
     cell_of: CellOf | None,
-) -> tuple[NetFile, Mapping[str, str], Mapping[str, str], str]:
-    """Return the GSPN of a task or net file, where each rate and weight comes from, by name, the
-    chains of phases in it (as `StochasticView` has them), and which cell is assumed (empty for a
-    net file).
+) -> tuple[StochasticView | NetFile, str]:
+    """Return the stochastic view of a task, or a net file with rates, and which cell is assumed
+    (empty for a net file).
 
     Raises NetFileError, NoEstimate and the errors of `load`.
     """
@@ -676,9 +675,7 @@ def gspn_of(
     cell = _cell(model, cell_of)
     known = _measured(model, measure, cell)
     if isinstance(model, Task):
-        view = stochastic_view(model, known, devices=devices_of(cell))
-        drawn = NetFile(view.gspn.net, model.name, view.gspn)
-        return drawn, view.sources, view.chains, assumed(cell)
+        return stochastic_view(model, known, devices=devices_of(cell)), assumed(cell)
     if model.gspn is None:
         raise NetFileError(str(path), "rates", "the file has none", "give a file with rates")
-    return model, dict.fromkeys(model.net.transitions, f"from {path.name}"), {}, ""
+    return model, ""

@@ -123,7 +123,7 @@ def _gspn(options: argparse.Namespace) -> str:
             raise CommandError(2, problem)
     path = task_path(options.task)
     try:
-        model, sources, chains, assumed = gspn_of(
+        model, assumed = gspn_of(
             path,
             measure=measurements(options.estimates),
             cell_of=cell_finder(options.services, options.task),
@@ -132,7 +132,8 @@ def _gspn(options: argparse.Namespace) -> str:
         text = str(fault)
         named = text if text.startswith(str(path)) else f"{path}: {text}"
         raise CommandError(2, named) from fault
-    return gspn_svg(model, sources, chains, model.name or path.stem, assumed)
+    legend = f"Assumed: {assumed}." if assumed else f"Rates and weights: {path.name}."
+    return gspn_svg(model, legend, path.stem)
 
 
 def _heat(task: Task, options: argparse.Namespace) -> Overlay:

@@ -18,6 +18,7 @@ from petrobot.coordinator.drawing.routing import (
 )
 from petrobot.coordinator.drawing.scene import (
     RADIUS,
+    Blocks,
     Caption,
     DrawnNode,
     Overlay,
@@ -29,7 +30,7 @@ from petrobot.coordinator.drawing.scene import (
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 
-__all__ = ["Caption", "Overlay", "draw", "expanded"]
+__all__ = ["Blocks", "Caption", "Overlay", "draw", "expanded"]
 
 
 def draw(
@@ -41,6 +42,7 @@ def draw(
     overlay: Overlay | None = None,
     inside: str = "",
     captions: Mapping[str, Caption] | None = None,
+    blocks: Blocks | None = None,
 ) -> str:
     """Return the SVG text of a task or net.
 
@@ -48,10 +50,10 @@ def draw(
     place counts its hidden outgoing transitions. `marking` (of `Task.net`, or of the net) replaces
     the initial tokens. `overlay` colours nodes and numbers the firings of a path. `inside` opens a
     macro place, named as in the flat task; raises ValueError if there is none. `captions` replace
-    the labels of the nodes of a net.
+    the labels of the nodes of a net, `blocks` lay it out as a task.
     """
     scene = (
-        scene_of_net(model, marking, title, captions)
+        scene_of_net(model, marking, title, captions, blocks)
         if isinstance(model, Net)
         else scene_of_task(model, error_branches, marking, title, inside)
     )

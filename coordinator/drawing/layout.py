@@ -12,16 +12,20 @@ hierarchical system structures, IEEE Trans. SMC 11 (1981), in four steps:
 A net of `FOLDED_FROM` columns or more is folded into bands, one below the other, that run to the
 right and to the left in turn. Resources then take no part in the layers: they are put between the
 nodes that use them.
+
+A net that refines a smaller one is laid out in blocks: what stands for one node of the smaller net
+has layers of its own, and the blocks lie as those nodes do.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from itertools import pairwise
+from math import inf
 
 Point = tuple[float, float]
 Edge = tuple[str, str]
@@ -50,6 +54,10 @@ WIDEST = 14
 FOLDED_FROM = 28
 """Columns from which a layout is folded: a fold costs crossings, so what a reader can still follow
 stays in one band."""
+_WIDER = 1.4
+"""How much farther apart than usual the columns of a block are: its labels are long."""
+_BETWEEN = 1.5
+"""Distance between two blocks, in columns and rows."""
 _SETTLINGS = 20
 """Passes in which the heights of nodes approach those of their neighbours."""
 _STRAIGHT = (1.0, 3.0, 9.0)
@@ -290,6 +298,97 @@ def lay_out(
     layers = Layers(names, inner, [name for name in sources if name not in aside])
     placed = _folded(_layered(layers, names, inner), len(layers.columns))
     return NodePositions(_fill_in(list(wanted), placed.at, edges), placed.through)
+
+
+def lay_out_blocks(
+    block_of: Mapping[str, str], at: Mapping[str, Point], edges: Sequence[Edge]
+) -> NodePositions:
+    """Return a position for every node. Those of one block (`block_of`) stand together, and the
+    blocks lie to each other as `at` says; one without a position lies amid those it is joined
+    with."""
+    members = defaultdict[str, list[str]](list)
+    for name, block in block_of.items():
+        members[block].append(name)
+    inner, entries = defaultdict[str, list[Edge]](list), set[str]()
+    for a, b in edges:
+        if block_of[a] == block_of[b]:
+            inner[block_of[a]].append((a, b))
+        else:
+            entries.add(b)
+    laid = {
+        block: lay_out(
+            dict.fromkeys(names), inner[block], [name for name in names if name in entries]
+        )
+        for block, names in members.items()
+    }
+    cells = defaultdict[tuple[int, int], list[str]](list)
+    ends = dict.fromkeys((block_of[a], block_of[b]) for a, b in edges)
+    wanted = dict[str, Point]()
+    for block in members:
+        near = [at[b] for pair in ends if block in pair for b in pair if b in at]
+        wanted[block] = at[block] if block in at else _mean(near) if near else (MARGIN, MARGIN)
+    columns = _ranks((x for x, _ in wanted.values()), COLUMN / 2)
+    rows = _ranks((y for _, y in wanted.values()), ROW / 2)
+    for block, (x, y) in wanted.items():
+        cells[columns[x], rows[y]].append(block)
+    widths, heights = defaultdict[int, float](float), defaultdict[int, float](float)
+    for (column, row), blocks in cells.items():
+        sizes = [_size(laid[block]) for block in blocks]
+        widths[column] = max(widths[column], *(width for width, _ in sizes))
+        heights[row] = max(heights[row], sum(height + ROW for _, height in sizes) - ROW)
+    left, top = (
+        _starts(sizes, _BETWEEN * gap) for sizes, gap in ((widths, COLUMN), (heights, ROW))
+    )
+    found, through = dict[str, Point](), dict[Edge, Sequence[Point]]()
+    for (column, row), blocks in cells.items():
+        total = sum(_size(laid[block])[1] + ROW for block in blocks) - ROW
+        y = top[row] + (heights[row] - total) / 2
+        for block in blocks:
+            width, height = _size(laid[block])
+            corner = left[column] + (widths[column] - width) / 2, y
+            moved = _moved(laid[block], corner)
+            found |= moved.at
+            through |= moved.through
+            y += height + ROW
+    return NodePositions(found, through)
+
+
+def _ranks(values: Iterable[float], apart: float) -> dict[float, int]:
+    """Return the rank of each value; those less than `apart` above the first of a rank share it."""
+    ranks, first, rank = dict[float, int](), -inf, -1
+    for value in sorted(set(values)):
+        if value - first >= apart:
+            first, rank = value, rank + 1
+        ranks[value] = rank
+    return ranks
+
+
+def _starts(sizes: Mapping[int, float], gap: float) -> dict[int, float]:
+    """Return where each column or row begins."""
+    starts, start = dict[int, float](), MARGIN
+    for rank in sorted(sizes):
+        starts[rank] = start
+        start += sizes[rank] + gap
+    return starts
+
+
+def _size(block: NodePositions) -> Point:
+    """Return width and height of a block."""
+    xs, ys = zip(*block.at.values(), strict=True)
+    return _WIDER * (max(xs) - min(xs)), max(ys) - min(ys)
+
+
+def _moved(block: NodePositions, corner: Point) -> NodePositions:
+    """Return a block widened, with its nodes to the right of and below a corner."""
+    left, top = (min(values) for values in zip(*block.at.values(), strict=True))
+
+    def to(point: Point) -> Point:
+        return corner[0] + _WIDER * (point[0] - left), corner[1] + point[1] - top
+
+    return NodePositions(
+        {name: to(point) for name, point in block.at.items()},
+        {edge: [to(point) for point in way] for edge, way in block.through.items()},
+    )
 
 
 def _fill_in(

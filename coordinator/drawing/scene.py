@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from petrobot.coordinator.drawing.layout import Edge, Point, lay_out
+from petrobot.coordinator.drawing.layout import Edge, Point, lay_out, lay_out_blocks
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
 from petrobot.coordinator.task.expansion import macros_around, with_error_branches
 from petrobot.coordinator.task.net import Marking, Net
@@ -212,6 +212,15 @@ class Caption:
 
 
 @dataclass(frozen=True, slots=True)
+class Blocks:
+    """The element of a flat task (`of`) that each node of a net stands for in part: the net is laid
+    out as the task is."""
+
+    task: Task
+    of: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
 class Overlay:
     """Information drawn over a scene: halos of places or transitions (0 to 1), a path of
     firings."""
@@ -328,6 +337,7 @@ def scene_of_net(
     marking: Marking | None,
     title: str | None,
     captions: Mapping[str, Caption] | None = None,
+    blocks: Blocks | None = None,
 ) -> Scene:
     """Return the scene of a net; captions replace the names of some nodes."""
     arcs: list[Arc] = []
@@ -336,12 +346,14 @@ def scene_of_net(
         arcs += [Arc(name, net.places[p], w) for p, w in net.produce[t]]
         arcs += [Arc(net.places[p], name, k, "inhibitor") for p, k in net.inhibit[t]]
     tokens = marking or net.initial
-    wanted: dict[str, Point | None] = dict.fromkeys((*net.places, *net.transitions))
-    layout = lay_out(
-        wanted,
-        [(a.source, a.target) for a in arcs],
-        [p for p, n in zip(net.places, tokens, strict=True) if n],
-    )
+    edges = [(a.source, a.target) for a in arcs]
+    if blocks is None:
+        wanted: dict[str, Point | None] = dict.fromkeys((*net.places, *net.transitions))
+        marked = [p for p, n in zip(net.places, tokens, strict=True) if n]
+        layout = lay_out(wanted, edges, marked)
+    else:
+        drawn = scene_of_task(expanded(blocks.task), True, None, None).nodes
+        layout = lay_out_blocks(blocks.of, {name: drawn[name].at for name in drawn}, edges)
     at = layout.at
     captions = captions or {}
     nodes: dict[str, DrawnNode] = {}

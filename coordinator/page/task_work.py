@@ -141,7 +141,6 @@ def export(text: str, filename: str, form: str, cell: Fields) -> ConvertedTask:
 
         return ConvertedTask(write_pnml(net_file_of(task)), "application/xml")
     if form == "gspn.svg":
-        from petrobot.coordinator.analysis.formats.netfile import NetFile
         from petrobot.coordinator.analysis.time.stochastic import stochastic_view
         from petrobot.coordinator.studies.report.gspn_picture import gspn_svg
 
@@ -150,10 +149,7 @@ def export(text: str, filename: str, form: str, cell: Fields) -> ConvertedTask:
             view = stochastic_view(task, devices=devices_of(known))
         except ValueError as fault:
             raise FormatError(f"no stochastic view: {fault}") from fault
-        model = NetFile(view.gspn.net, task.name, view.gspn)
-        return ConvertedTask(
-            gspn_svg(model, view.sources, view.chains, task.name, assumed(known)), "image/svg+xml"
-        )
+        return ConvertedTask(gspn_svg(view, f"Assumed: {assumed(known)}."), "image/svg+xml")
     raise FormatError(f"no format {form!r}: toml, pnml and gspn.svg are known")
 
 

@@ -9,33 +9,35 @@ from collections.abc import Mapping
 
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.time.gspn import Gspn
-from petrobot.coordinator.drawing import Caption, Overlay, draw
+from petrobot.coordinator.analysis.time.stochastic import StochasticView
+from petrobot.coordinator.drawing import Blocks, Caption, Overlay, draw
+from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Net
 
 
-def gspn_svg(
-    model: NetFile,
-    sources: Mapping[str, str],
-    chains: Mapping[str, str],
-    title: str,
-    assumed: str,
-) -> str:
-    """Return the drawing of a net with rates. `sources`: where the number of a transition comes
-    from; `chains`: by place, the chain of phases that is drawn as one place; `assumed`: which cell,
-    empty for a net of another tool."""
-    assert model.gspn is not None
-    folded, names = folded_chains(model.gspn, chains)
+def gspn_svg(model: StochasticView | NetFile, legend: str, title: str = "") -> str:
+    """Return the drawing of a net with rates. The stochastic view of a task is laid out as the
+    task is, and each number says where it comes from. `title`: of a net without a name."""
+    if isinstance(model, StochasticView):
+        name, gspn, sources, chains = model.task.name, model.gspn, model.sources, model.chains
+    else:
+        assert model.gspn is not None
+        name, gspn, sources, chains = model.name, model.gspn, {}, {}
+    folded, names = folded_chains(gspn, chains)
     # In a GSPN of a task a place and a transition may have the same name; a drawing needs two.
     renamed, _ = NetFile(folded.net, gspn=folded).with_names(re.compile(".+", re.DOTALL))
+    new_names = dict(zip(folded.net.transitions, renamed.net.transitions, strict=True))
     phases = Counter(chains.values())
     captions = {
-        new: _caption(folded, t, sources.get(names[name], ""), phases)
-        for t, (new, name) in enumerate(
-            zip(renamed.net.transitions, folded.net.transitions, strict=True)
-        )
+        new_names[old]: _caption(folded, t, sources.get(names[old], ""), phases)
+        for t, old in enumerate(folded.net.transitions)
     }
-    overlay = Overlay(legend=f"Assumed: {assumed}." if assumed else "")
-    return draw(renamed.net, title=title, captions=captions, overlay=overlay)
+    blocks = None
+    if isinstance(model, StochasticView):
+        origins = {new: model.origin.get(names[old], "") for old, new in new_names.items()}
+        blocks = blocks_of(renamed.net, origins, model.task)
+    overlay = Overlay(legend=legend)
+    return draw(renamed.net, title=name or title, captions=captions, overlay=overlay, blocks=blocks)
 
 
 def folded_chains(gspn: Gspn, chains: Mapping[str, str]) -> tuple[Gspn, dict[str, str]]:
@@ -83,6 +85,25 @@ def folded_chains(gspn: Gspn, chains: Mapping[str, str]) -> tuple[Gspn, dict[str
             rates[drawn] = rate
     folded = Net.build(tokens, arcs, inhibitors=inhibitors, priority=priority)
     return Gspn.of(folded, rates, weights=weights, servers=servers), names
+
+
+def blocks_of(net: Net, origins: Mapping[str, str], task: Task) -> Blocks:
+    """Return for each node the element of the task that it stands for in part. A transition stands
+    for the place of all its arcs, else for the transition of the task that it is a case of."""
+    elements = {*task.flat.places, *task.flat.transitions}
+
+    def named(name: str) -> str:
+        while name and name not in elements:
+            name = name.rpartition(".")[0]
+        return name
+
+    of = {place: named(place) or place for place in net.places}
+    for t, name in enumerate(net.transitions):
+        around = [of[net.places[p]] for p, _ in (*net.consume[t], *net.produce[t])]
+        places = {block for block in around if block in elements}
+        only = places.pop() if len(places) == 1 else ""
+        of[name] = only or origins[name] or named(name) or next(iter(around), name)
+    return Blocks(task, of)
 
 
 def _key(arcs: Mapping[str, int]) -> frozenset[tuple[str, int]]:

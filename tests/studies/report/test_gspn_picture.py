@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from itertools import combinations
 
 import pytest
 
@@ -10,7 +12,9 @@ from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.cli.loading import load_task
-from petrobot.coordinator.studies.report.gspn_picture import folded_chains, gspn_svg
+from petrobot.coordinator.drawing.layout import COLUMN, ROW
+from petrobot.coordinator.drawing.scene import scene_of_net, scene_of_task
+from petrobot.coordinator.studies.report.gspn_picture import blocks_of, folded_chains, gspn_svg
 from petrobot.coordinator.task.net import Net
 
 
@@ -44,10 +48,37 @@ def test_chains_are_one_place_and_choices_stay(view: StochasticView) -> None:
 
 
 def test_a_duration_says_its_phases(view: StochasticView) -> None:
-    model = NetFile(view.gspn.net, gspn=view.gspn)
-    drawn = gspn_svg(model, view.sources, view.chains, "catch", "")
+    drawn = gspn_svg(view, "Assumed: nothing.")
     assert "8 phases of" in drawn and "locate_ball.success.0a" in drawn
     assert "locate_ball.success.0a1" not in drawn
+
+
+def test_it_is_laid_out_as_the_task(view: StochasticView) -> None:
+    """What stands for one action place is together; the places lie as in the task's drawing."""
+    folded, names = folded_chains(view.gspn, view.chains)
+    model, _ = NetFile(folded.net).with_names(
+        re.compile(".+")
+    )  # no place is called as a transition
+    new = dict(zip(model.net.transitions, folded.net.transitions, strict=True))
+    origins = {t: view.origin.get(names[old], "") for t, old in new.items()}
+    blocks = blocks_of(model.net, origins, view.task)
+    assert blocks.of["track_ball.predict_kalman.success"] == "track_ball"
+    assert {blocks.of[name] for name in ("in_place 1", "in_place 2")} == {"in_place"}
+    scene = scene_of_net(model.net, None, None, None, blocks)
+    boxes = dict[str, tuple[float, float, float, float]]()
+    for name, block in blocks.of.items():
+        x, y = scene.nodes[name].at
+        left, top, right, bottom = boxes.get(block, (x, y, x, y))
+        boxes[block] = min(x, left), min(y, top), max(x, right), max(y, bottom)
+    for (a, one), (b, other) in combinations(boxes.items(), 2):
+        beside = one[2] < other[0] or other[2] < one[0] or one[3] < other[1] or other[3] < one[1]
+        assert beside, (a, b)
+    task = scene_of_task(view.task, True, None, None).nodes
+    for a, b in combinations(set(task) & set(boxes), 2):
+        for axis, least in ((0, COLUMN), (1, ROW)):
+            if task[b].at[axis] - task[a].at[axis] > least:
+                centre = [sum(boxes[block][axis::2]) for block in (a, b)]
+                assert centre[0] < centre[1], (a, b)
 
 
 def test_entries_at_several_phases_are_one_and_other_nets_stay_as_they_are() -> None:
