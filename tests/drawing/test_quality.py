@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from petrobot.coordinator.drawing.layout import COLUMN, WIDEST, Point
+from petrobot.coordinator.drawing.layout import COLUMN, ROW, WIDEST, Point, lay_out_blocks
 from petrobot.coordinator.drawing.routing import ArcPath, Box, LabelBox, place_words, route
 from petrobot.coordinator.drawing.scene import (
     DrawnNode,
@@ -213,3 +213,21 @@ def test_what_follows_without_a_branch_is_level() -> None:
     nodes = scene_of_task(load(SORTER), False, None, None).nodes
     row = {nodes[name].at[1] for name in ("scanned", "pick", "fetch", "there", "grip")}
     assert len(row) == 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_blocks_never_overlap(seed: int) -> None:
+    """At random places, some of them nearly equal, some unknown; joined within and at random."""
+    rng = np.random.default_rng(seed)
+    block_of = {f"n{i}": f"b{rng.integers(9)}" for i in range(60)}
+    at = {f"b{i}": (float(rng.integers(5)) * 90, float(rng.integers(5)) * 40) for i in range(7)}
+    edges = [(f"n{a}", f"n{b}") for a, b in rng.integers(60, size=(90, 2)).tolist()]
+    found = lay_out_blocks(block_of, at, edges).at
+    assert set(found) == set(block_of)
+    boxes = dict[str, list[float]]()
+    for name, (x, y) in found.items():
+        left, top, right, bottom = boxes.get(block_of[name], [x, y, x, y])
+        boxes[block_of[name]] = [min(x, left), min(y, top), max(x, right), max(y, bottom)]
+    for (a, one), (b, other) in combinations(boxes.items(), 2):
+        aside = max(other[0] - one[2], one[0] - other[2]) >= COLUMN
+        assert aside or max(other[1] - one[3], one[1] - other[3]) >= ROW, (a, b)
