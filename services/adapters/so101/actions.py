@@ -72,7 +72,8 @@ async def release(ctx: Context[Remote], *, angle: float = 1.0, timeout: float = 
 
 
 async def enable(ctx: Context[Remote]) -> Result:
-    """Clear faults and switch torque on at the present position."""
+    """Clear faults and switch torque on where the arm is. A servo that has torque keeps its goal if
+    that is at most 0.3 rad away, so that it still carries its load."""
     return await _do(ctx, {"do": "enable"}, lambda state: state["ready"], 2.0)
 
 

@@ -7,7 +7,8 @@ and angle. Commands are plain data; the key `do` names them:
     {"do": "calibrate", "pose": six angles (rad)}   the arm is in this pose now (default: all 0);
                                         the zero positions are written to the calibration file
     {"do": "free"}                      torque off: the arm falls unless it is held
-    {"do": "enable"}                    clear faults, torque on at the present position
+    {"do": "enable"}                    clear faults, torque on where the arm is; a servo that has
+                                        torque keeps a near goal, so that it carries its load
     {"do": "rest"}                      stop and stay there
 """
 
