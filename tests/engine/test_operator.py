@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -260,6 +261,15 @@ def test_step_and_pause_after_the_end_are_refused(play: Plays) -> None:
     assert p.finished.status is OK
     p(Pause(), Step(), Resume(), Abort())
     assert p.reports == ["finished"] * 4 and p.state.mode == "finished"
+
+
+def test_step_and_pause_while_an_abort_stops_runs_are_refused(play: Plays) -> None:
+    p = play("x a!=1 b! y", LINE, "e")
+    p(Abort())
+    before = p.state
+    p(Pause(), Step(), Resume())
+    assert p.reports == ["refused"] * 3 and before.mode == "aborting"
+    assert p.state == replace(before, stimuli=p.state.stimuli)
 
 
 def test_pause_waits_for_an_outstanding_draw_but_abort_does_not(play: Plays) -> None:
