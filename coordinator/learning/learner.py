@@ -416,9 +416,13 @@ class LearningSelector(FirstAlternative):
         """Record the verdict on the actions of these runs, if the task is to judge them."""
         if self.learning.credit != TASK:
             return
-        for verdict in verdicts_of_task(
-            runs, bool(trial.met), trial.seconds, lambda name: self.learning.question(name).measure
-        ):
+        measure = {p: self.learning.question(p).measure for p in self.learning.task.primitive_tasks}
+        if self._declared is not None:  # in lock step no measured time may influence a choice
+            runs = [
+                (name, action, context, end if measure[name] == "cpu" else _without_cpu(end))
+                for name, action, context, end in runs
+            ]
+        for verdict in verdicts_of_task(runs, bool(trial.met), trial.seconds, measure.__getitem__):
             self._note(replace(verdict, beside=()) if late else verdict)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
@@ -446,6 +450,10 @@ class LearningSelector(FirstAlternative):
             what = (end.primitive_task, end.action, end.context, end.outcome)
             age = self._trials[end.primitive_task, end.context] - trials
             self._note(Correction(*what, corrected.status, corrected.cause, age))
+
+
+def _without_cpu(end: Observation) -> Observation:
+    return replace(end, cpu_seconds=None)
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -103,8 +103,8 @@ def test_the_task_judges_each_action_of_a_token_once() -> None:
 
 
 def breaking() -> Task:
-    """The sorting task, which gives up for good when a part is lost."""
-    text = TASK_FILE.read_text(encoding="utf-8")
+    """The sorting task, which gives up for good when a part is lost; picking costs CPU time."""
+    text = TASK_FILE.read_text(encoding="utf-8").replace('cost = "wall"', 'cost = "cpu"')
     text = text.replace('free == 1"\n', 'free == 1"\nfinal_error = "broken == 1"\n')
     text = text.replace(
         'in = ["place:error"]\nout = ["free"]', 'in = ["place:error"]\nout = ["broken"]'
@@ -116,13 +116,15 @@ def breaking() -> Task:
 def test_a_mission_run_judges_as_a_campaign_does(task: Task, gives_up: bool) -> None:
     """The verdicts of the learning selector are those that the rows of a campaign's table give:
     the same trials, goals, durations and costs. They come before the next token is taken. A trial
-    in which the task gave up as designed has not met the goal, and no duration."""
+    in which the task gave up as designed has not met the goal, and no duration. No measured CPU
+    time counts, also of runs whose own cost is another."""
     does = scripts()
     if gives_up:
         task = breaking()
         lines = [ScriptedRun(seconds=(0.2, 0.2))] * 9 + [ScriptedRun(Status.ERROR, (0.2, 0.2))]
         does |= {name: Scripted(lines) for name in ("place_soft", "place_hard")}
-    selector = LearningSelector(Learning(task, "nikolic_fu", credit="task"), seed=3)
+    learning = Learning(task, "nikolic_fu", credit="task")
+    selector = LearningSelector(learning, seed=3, declared={})
     log = TrialLog(task, costs(task, directory(task)))
     played(task, selector, 40, does, log)
     assert [trial.time is None for trial in log.trials].count(True) == gives_up
@@ -145,6 +147,7 @@ def test_a_mission_run_judges_as_a_campaign_does(task: Task, gives_up: bool) -> 
     for mine, table in zip(found, expected, strict=True):
         assert mine.outcome.seconds == pytest.approx(table.outcome.seconds, abs=2e-6, nan_ok=True)
         assert mine.outcome.values == pytest.approx(table.outcome.values, nan_ok=True)
+        assert mine.outcome.cpu_seconds == table.outcome.cpu_seconds
     ended, judged = 0, 0
     for record in selector.records:
         ended += isinstance(record, RunEnd) and record.primitive_task == "pick"
