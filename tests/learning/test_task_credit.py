@@ -28,6 +28,7 @@ from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
 from petrobot.services.action import Context, Result, error, success
+from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.scripted import Scripted, ScriptedRun
 from tests.learning.cell import TASK_FILE, directory, scripts, sorting
@@ -121,7 +122,9 @@ def test_a_mission_run_judges_as_a_campaign_does(task: Task, gives_up: bool) -> 
     does = scripts()
     if gives_up:
         task = breaking()
-        lines = [ScriptedRun(seconds=(0.2, 0.2))] * 9 + [ScriptedRun(Status.ERROR, (0.2, 0.2))]
+        lines = [ScriptedRun(seconds=(0.2, 0.2))] * 9 + [
+            ScriptedRun(ActionStatus.ERROR, (0.2, 0.2))
+        ]
         does |= {name: Scripted(lines) for name in ("place_soft", "place_hard")}
     learning = Learning(task, "nikolic_fu", credit="task")
     selector = LearningSelector(learning, seed=3, declared={})
