@@ -7,7 +7,7 @@ import argparse
 import asyncio
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -323,7 +323,7 @@ def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
         parameters={name: parameter_of(task, name, text) for name, text in given.items()},
         block=_block(task, options.block),
         batch=(options.batch or BATCH) if learns(options.selector) else 0,
-        options=_selector_options(options),
+        options=_selector_options(options, regimes),
         digests={key: digest(path) for key, path in paths.items()},
         physics=_physics(options.services),
     )
@@ -350,7 +350,7 @@ def _block(task: Task, wanted: int | None) -> int:
     return wanted or max(1, tokens)
 
 
-def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
+def _selector_options(options: argparse.Namespace, regimes: Sequence[str]) -> dict[str, Any]:
     from petrobot.coordinator.studies.campaign.policies import learned_choices, learns
 
     for name in () if learns(options.selector) else ("credit", "batch"):
@@ -370,7 +370,13 @@ def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
             raise CommandError(
                 2, f"--learned chooses what was learned; leave --selector {options.selector} out"
             )
-        found["by_regime"] = learned_choices(options.learned)
+        found["by_regime"] = learned = learned_choices(options.learned)
+        if unknown := [regime or "-" for regime in regimes if regime not in learned]:
+            raise CommandError(
+                2,
+                f"--learned {options.learned}: nothing was learned of regime {unknown[0]}; there "
+                f"are {', '.join(learned)}",
+            )
     return found
 
 

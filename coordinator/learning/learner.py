@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from petrobot.coordinator.engine.instructions import (
     StartRun,
 )
 from petrobot.coordinator.engine.state import Phase
-from petrobot.coordinator.engine.stimuli import Begin, Chosen, RunEnded, Stimulus
+from petrobot.coordinator.engine.stimuli import Abort, Begin, Chosen, RunEnded, Stimulus
 from petrobot.coordinator.learning.estimate import COUNT, Observation
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import (
@@ -182,6 +183,7 @@ class LearningSelector(FirstAlternative):
         self._latest = NOBODY
         self._served: dict[str, _Trial] = {}
         """The trial of each active run."""
+        self._aborted = False
 
     @property
     def context(self) -> str:
@@ -242,6 +244,8 @@ class LearningSelector(FirstAlternative):
             self._choice(now, stimulus)
         elif isinstance(stimulus, RunEnded):
             self._run(now, stimulus.run).ended = stimulus
+        elif isinstance(stimulus, Abort):
+            self._aborted = True
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Turn the executor's records into records of learning."""
@@ -373,12 +377,16 @@ class LearningSelector(FirstAlternative):
                 self._judge(now, trial, trial.goals > 0 or not self._goals)
 
     def _finished(self, now: float, finished: Finished) -> None:
-        """Judge the last tokens if the task came to its end, or if the goal was met before it was
-        given up. What was given up otherwise is censored, and what was cut is not recorded."""
+        """Judge the last tokens if the task came to its end, also by `final_error`, or if the goal
+        was met before the end. Of an aborted run nobody can say what it would have come to, so it
+        is censored; trials that were cut by the loss of another one are not recorded."""
         success, lost = finished.status is Status.SUCCESS, self._tokens.lost(finished)
         for trial in [*self._open.values()]:
+            gave_up = trial.number in lost and not self._aborted
             if trial.met is None and (success or trial.goals):
                 self._judge(now, trial, trial.goals > 0 or not self._goals)
+            elif trial.met is None and gave_up:
+                self._judge(nan, trial, False)
             if success or trial.back or trial.goals or trial.number in lost:
                 met = trial.back or (bool(trial.goals) and trial.number not in lost)
                 self._count(trial, success or met)
@@ -395,7 +403,8 @@ class LearningSelector(FirstAlternative):
         self._note(TrialEnd(*told, runs))
 
     def _judge(self, now: float, trial: _Trial, met: bool) -> None:
-        trial.met, trial.seconds = met, round(max(0.0, now - trial.begun), 6)
+        """Give the verdict on a trial that ended at `now` (s; nan: it never came to its end)."""
+        trial.met, trial.seconds = met, round(max(now - trial.begun, 0.0), 6)
         self._credit(trial, trial.runs)
 
     def _credit(
@@ -407,9 +416,13 @@ class LearningSelector(FirstAlternative):
         """Record the verdict on the actions of these runs, if the task is to judge them."""
         if self.learning.credit != TASK:
             return
-        for verdict in verdicts_of_task(
-            runs, bool(trial.met), trial.seconds, lambda name: self.learning.question(name).measure
-        ):
+        measure = {p: self.learning.question(p).measure for p in self.learning.task.primitive_tasks}
+        if self._declared is not None:  # in lock step no measured time may influence a choice
+            runs = [
+                (name, action, context, end if measure[name] == "cpu" else _without_cpu(end))
+                for name, action, context, end in runs
+            ]
+        for verdict in verdicts_of_task(runs, bool(trial.met), trial.seconds, measure.__getitem__):
             self._note(replace(verdict, beside=()) if late else verdict)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
@@ -437,6 +450,10 @@ class LearningSelector(FirstAlternative):
             what = (end.primitive_task, end.action, end.context, end.outcome)
             age = self._trials[end.primitive_task, end.context] - trials
             self._note(Correction(*what, corrected.status, corrected.cause, age))
+
+
+def _without_cpu(end: Observation) -> Observation:
+    return replace(end, cpu_seconds=None)
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -29,6 +29,11 @@ from petrobot.coordinator.learning.statistics import (
 )
 from petrobot.coordinator.task import Status
 
+SURER = 1.2
+"""Factor of the interval of a difference, for two J that are to be told apart. The intervals of R
+are approximate: with 2 to 60 runs each, and without this factor, one of two equal actions has the
+lower J "for sure" in up to 12.5 % of cases (2 of 2 beside 0 of 2), with it in at most 3.1 %."""
+
 
 @dataclass(frozen=True, slots=True)
 class Question:
@@ -140,7 +145,7 @@ class Comparison:
             for f in self.figures
             if f.action != best.action
             and f.j < inf
-            and not f.j - best.j > joined(f.j - f.j_lower, best.j_upper - best.j)
+            and not f.j - best.j > SURER * joined(f.j - f.j_lower, best.j_upper - best.j)
         )
 
     @property

@@ -265,8 +265,6 @@ class _Search:
                 for t, (x, y) in zip(track.times, track.places, strict=True)
             ],
         }
-        if asked.within > 0.0:
-            ball |= {"run": self._ctx.run, "within": asked.within}
         values = {"ball": ball, "images": self._images, "residual": track.residual, "ahead": ahead}
         if ahead < asked.min_ahead:
             return failure(
@@ -275,6 +273,7 @@ class _Search:
                 **values,
             )
         if asked.within > 0.0:
+            ball |= {"run": self._ctx.run, "within": asked.within}  # the tracker judges
             return provisional(success(**values))
         if track.residual > asked.max_residual:
             text = (

@@ -3,7 +3,7 @@ target reliability and cost in both directions."""
 
 from __future__ import annotations
 
-from math import inf, isnan
+from math import comb, inf, isnan
 
 import pytest
 from hypothesis import given
@@ -276,3 +276,25 @@ def test_declared_costs_count_until_measurements_replace_them() -> None:
     now = compare({"a": {"": measured}, "b": {"": ran}}, question)
     assert now.of("a").cost == 2.0
     assert now.of("b").cost == 1.0
+
+
+@pytest.mark.parametrize(("one", "other"), [(2, 2), (2, 5), (3, 3), (4, 4), (6, 7)])
+def test_few_runs_do_not_make_one_of_two_equal_actions_clearly_the_best(
+    one: int, other: int
+) -> None:
+    """Every outcome is counted with its probability, whatever R of both is."""
+
+    def chances(n: int, r: float) -> list[float]:
+        return [comb(n, k) * r**k * (1 - r) ** (n - k) for k in range(n + 1)]
+
+    clear = [
+        (a, b)
+        for a in range(one + 1)
+        for b in range(other + 1)
+        if compare(
+            {"one": {"": runs(a, one - a)}, "other": {"": runs(b, other - b)}}, Question()
+        ).clear
+    ]
+    for r in (0.3, 0.5, 0.7, 0.9):
+        mine, yours = chances(one, r), chances(other, r)
+        assert sum(mine[a] * yours[b] for a, b in clear) < 0.05

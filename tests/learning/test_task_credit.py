@@ -26,9 +26,12 @@ from petrobot.coordinator.studies.campaign.block import costs
 from petrobot.coordinator.studies.campaign.observed import observation
 from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Executed, Status, Task
+from petrobot.coordinator.task.file import loads
 from petrobot.services.action import Context, Result, error, success
+from petrobot.services.action import Status as ActionStatus
 from petrobot.services.comm.lockstep.party import TICK
-from tests.learning.cell import directory, scripts, sorting
+from petrobot.services.scripted import Scripted, ScriptedRun
+from tests.learning.cell import TASK_FILE, directory, scripts, sorting
 
 Scripts = Mapping[str, Callable[..., Any]]
 
@@ -100,22 +103,44 @@ def test_the_task_judges_each_action_of_a_token_once() -> None:
     assert math.isnan(unknown.outcome.values["none"])
 
 
-def test_a_mission_run_judges_as_a_campaign_does(task: Task) -> None:
+def breaking() -> Task:
+    """The sorting task, which gives up for good when a part is lost; picking costs CPU time."""
+    text = TASK_FILE.read_text(encoding="utf-8").replace('cost = "wall"', 'cost = "cpu"')
+    text = text.replace('free == 1"\n', 'free == 1"\nfinal_error = "broken == 1"\n')
+    text = text.replace(
+        'in = ["place:error"]\nout = ["free"]', 'in = ["place:error"]\nout = ["broken"]'
+    )
+    return loads(text + '\n[places.broken]\nkind = "control"\n', "sorting.toml")
+
+
+@pytest.mark.parametrize("gives_up", [False, True])
+def test_a_mission_run_judges_as_a_campaign_does(task: Task, gives_up: bool) -> None:
     """The verdicts of the learning selector are those that the rows of a campaign's table give:
-    the same trials, goals, durations and costs. They come before the next token is taken."""
-    selector = LearningSelector(Learning(task, "nikolic_fu", credit="task"), seed=3)
+    the same trials, goals, durations and costs. They come before the next token is taken. A trial
+    in which the task gave up as designed has not met the goal, and no duration. No measured CPU
+    time counts, also of runs whose own cost is another."""
+    does = scripts()
+    if gives_up:
+        task = breaking()
+        lines = [ScriptedRun(seconds=(0.2, 0.2))] * 9 + [
+            ScriptedRun(ActionStatus.ERROR, (0.2, 0.2))
+        ]
+        does |= {name: Scripted(lines) for name in ("place_soft", "place_hard")}
+    learning = Learning(task, "nikolic_fu", credit="task")
+    selector = LearningSelector(learning, seed=3, declared={})
     log = TrialLog(task, costs(task, directory(task)))
-    played(task, selector, 40, log=log)
+    played(task, selector, 40, does, log)
+    assert [trial.time is None for trial in log.trials].count(True) == gives_up
     expected: list[Credit] = []
     for trial in log.trials:
-        assert trial.time is not None
+        took = math.nan if trial.time is None else trial.time
         ends = [
             (name, run.action, "regime=A", observation(task, run))
             for run in trial.runs
             for name in [task.primitive_task_of(run.place).name]
         ]
         expected += verdicts_of_task(
-            ends, trial.goals > 0, trial.time, lambda name: task.primitive_tasks[name].cost
+            ends, trial.goals > 0, took, lambda name: task.primitive_tasks[name].cost
         )
     found = verdicts(selector)
     assert {one.outcome.status for one in found} == {Status.SUCCESS, Status.FAILURE}
@@ -123,8 +148,9 @@ def test_a_mission_run_judges_as_a_campaign_does(task: Task) -> None:
         (c.primitive_task, c.action, c.context, c.outcome.status) for c in expected
     ]
     for mine, table in zip(found, expected, strict=True):
-        assert mine.outcome.seconds == pytest.approx(table.outcome.seconds, abs=2e-6)
+        assert mine.outcome.seconds == pytest.approx(table.outcome.seconds, abs=2e-6, nan_ok=True)
         assert mine.outcome.values == pytest.approx(table.outcome.values, nan_ok=True)
+        assert mine.outcome.cpu_seconds == table.outcome.cpu_seconds
     ended, judged = 0, 0
     for record in selector.records:
         ended += isinstance(record, RunEnd) and record.primitive_task == "pick"

@@ -172,7 +172,7 @@ class Chart:
         """Return the legend entries with their positions, and the rows that they use."""
         out, rows, x = [], [0.0], float(self.left)
         for mark, name in self.legend:
-            needs = 34 + LETTER * len(name)
+            needs = 34 + 1.2 * LETTER * len(name)  # names of regimes have wide + and @
             if x > self.left and x + needs > self.width - RIGHT:
                 x = float(self.left)
                 rows.append(0.0)

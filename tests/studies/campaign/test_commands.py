@@ -359,6 +359,17 @@ def test_bad_input(
     assert said in capsys.readouterr().err
 
 
+def test_choices_of_another_regime_are_no_learned_choices(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first alternatives are not passed off as what was learned."""
+    result = {"selector": "thompson", "policy": {"easy": {}}}
+    (tmp_path / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    given = ["campaign", *TOY, "--regime", "easy,rough", "--learned", str(tmp_path)]
+    assert main(given) == 2
+    assert "nothing was learned of regime rough; there are easy" in capsys.readouterr().err
+
+
 # --- progress ---------------------------------------------------------------------------------
 
 
