@@ -217,13 +217,14 @@ def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[s
         "J_low": _number(f.j_lower),
         "J_high": _number(f.j_upper),
         "runs_needed": f.needed,
-        "runs_there": 0 if f.worst is None else by_context[f.worst].runs,
+        "runs_there": 0 if f.worst is None else by_context[f.worst].judged,
         "cost_mean": cost.mean if cost.n else None,
         "cost_deviation": cost.deviation,
         **_times(whole),
         "censored": whole.censored,
         "unknown": whole.unknown,
         "corrected": whole.corrected,
+        "unjudged": sum(whole.unjudged.values()),
         "causes": {
             f"{status}: {cause or '-'}": n
             for (status, cause), n in whole.counts.items()

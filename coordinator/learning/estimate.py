@@ -3,9 +3,11 @@
 A `Tally` holds counts by status and cause, durations, CPU time, costs and availability. It is
 immutable and can be merged: the tally of two sets of runs is the merge of their tallies, so runs of
 several machines add up. Reliability R is the relative frequency of SUCCESS among the runs that were
-executed and not censored (paper, section 3). An ERROR counts as not successful, also with `executed
-= unknown`. An ERROR of a run that never executed lowers only the availability A. A preempted run
-that counts `none` is censored: it only shows that the run lasted at least so long.
+executed, not censored and judged (paper, section 3). An ERROR counts as not successful, also with
+`executed = unknown`. An ERROR of a run that never executed lowers only the availability A. A
+preempted run that counts `none` is censored: it only shows that the run lasted at least so long. A
+run that ended provisionally and that nobody has judged says how such runs end and what they cost,
+but nothing about R.
 """
 
 from __future__ import annotations
@@ -145,6 +147,8 @@ class Observation:
     waited: float | None = None
     """Seconds that its token was in the place beyond `seconds`: choosing the action, waiting for
     the device, messages on their way."""
+    judged: bool = True
+    """False: its status is provisional, and nobody has judged it."""
 
     @property
     def exit(self) -> str:
@@ -186,13 +190,26 @@ class Tally:
     unknown_ends: Mapping[tuple[str, str], int] = field(default_factory=dict)
     """Runs in `unknown`, by (exit, cause). Runs from files older than this are in `unknown`
     alone."""
+    unjudged: Mapping[str, int] = field(default_factory=dict)
+    """Counted runs with a provisional status that nobody has judged, by that status. In files older
+    than this they are not known."""
 
     # --- reading ------------------------------------------------------------------------------
 
     @property
     def runs(self) -> int:
-        """Number of runs that count in R."""
+        """Number of counted runs."""
         return sum(self.counts.values())
+
+    @property
+    def judged(self) -> int:
+        """Number of runs that count in R."""
+        return self.runs - sum(self.unjudged.values())
+
+    @property
+    def successes(self) -> int:
+        """Number of these that were a SUCCESS."""
+        return self.count(Status.SUCCESS) - self.unjudged.get(Status.SUCCESS.value, 0)
 
     def count(self, status: Status) -> int:
         """Return the number of counted runs with this status."""
@@ -206,11 +223,11 @@ class Tally:
     @property
     def reliability(self) -> float:
         """R; nan if no run counts."""
-        return self.count(Status.SUCCESS) / self.runs if self.runs else float("nan")
+        return self.successes / self.judged if self.judged else float("nan")
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return Wilson's confidence interval of R."""
-        return wilson(self.count(Status.SUCCESS), self.runs, level)
+        return wilson(self.successes, self.judged, level)
 
     @property
     def availability(self) -> float:
@@ -320,6 +337,7 @@ class Tally:
             unknown_ends=_more(self.unknown_ends, (seen.exit, seen.cause))
             if unsure
             else self.unknown_ends,
+            unjudged=self.unjudged if seen.judged else _more(self.unjudged, status.value),
         )
 
     def correcting(self, was: Observation, status: Status, cause: str = "") -> Tally:
@@ -340,6 +358,9 @@ class Tally:
             durations=durations,
             sample=self.sample.corrected(was.seconds, before, after),
             unknown_ends=ends,
+            unjudged=_more(self.unjudged, was.status.value, -1)
+            if was.status.value in self.unjudged
+            else self.unjudged,
             corrected=self.corrected + (status is not was.status),
             changes=self.changes + 1,
         )
@@ -360,6 +381,7 @@ class Tally:
             self.changes + other.changes,
             self.sample.merged(other.sample),
             _summed(self.unknown_ends, other.unknown_ends),
+            _summed(self.unjudged, other.unjudged),
         )
 
     # --- plain data ---------------------------------------------------------------------------
@@ -378,6 +400,7 @@ class Tally:
             "changes": self.changes,
             "sample": self.sample.to_plain(),
             "unknown_ends": [[exit_, cause, n] for (exit_, cause), n in self.unknown_ends.items()],
+            "unjudged": dict(self.unjudged),
         }
 
     @classmethod
@@ -414,6 +437,10 @@ class Tally:
                 (str(exit_), str(cause)): whole(n, "runs of one exit and cause")
                 for exit_, cause, n in data.get("unknown_ends", ())
             },
+            {
+                Status(status).value: whole(n, "runs that nobody has judged")
+                for status, n in data.get("unjudged", {}).items()
+            },
         )
         read._check()
         return read
@@ -429,6 +456,8 @@ class Tally:
                     f"{self.count(status)} runs ended with {status}, but {timed} such runs "
                     "have a duration"
                 )
+            open_ = self.unjudged.get(status.value, 0)
+            whole(open_, f"runs with {status} that nobody has judged", self.count(status))
         whole(sum(self.unknown_ends.values()), "runs in unknown_ends", self.unknown)
         for (exit_, cause), n in self.unknown_ends.items():
             word = exit_.partition(":")[0]

@@ -9,7 +9,6 @@ recorded steps and so reaches the same state as a run that was never interrupted
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import nan
@@ -171,10 +170,8 @@ class LearningSelector(FirstAlternative):
         self._declared = declared
         self._values: Mapping[str, Any] = {}
         self._active: dict[str, _ActiveRun] = {}
-        self._deferred: dict[str, tuple[RunEnd, int]] = {}
-        """Runs whose verdict may still arrive, each with the number of trials of its primitive task
-        and context up to its end."""
-        self._trials: Counter[tuple[str, str]] = Counter()
+        self._deferred: dict[str, RunEnd] = {}
+        """Runs whose verdict may still arrive."""
         self._waits = EventWaits(learning.task)
         self._goals = frozenset(learning.task.flat.goal_transitions)
         self._tokens = TrialTokens(learning.task)
@@ -327,16 +324,11 @@ class LearningSelector(FirstAlternative):
             _numbers(result.values) if result is not None and preempted is None else {},
             preempted,
             round(max(0.0, now - active.entered - seconds), 6) if preempted is None else None,
+            not record.deferred,
         )
         end = RunEnd(record.primitive_task, record.action, context, outcome)
-        selector, where = (
-            self.learning.selectors.get(end.primitive_task),
-            (end.primitive_task, context),
-        )
-        if selector is not None and selector.learns_from(end.action, outcome):
-            self._trials[where] += 1
         if record.deferred:
-            self._deferred[record.run] = (end, self._trials[where])
+            self._deferred[record.run] = end
         self._note(end)
         latest = self._open.get(self._tokens.begun)
         trial = self._served.pop(record.run, latest)
@@ -444,12 +436,11 @@ class LearningSelector(FirstAlternative):
                     trial.runs[i] = (*run[:3], replace(was, status=status))
 
     def _corrected(self, corrected: Corrected) -> None:
-        end, trials = self._deferred.pop(corrected.run, (None, 0))
+        end = self._deferred.pop(corrected.run, None)
         if end is not None:
             self._replace(end.outcome, corrected.status)
             what = (end.primitive_task, end.action, end.context, end.outcome)
-            age = self._trials[end.primitive_task, end.context] - trials
-            self._note(Correction(*what, corrected.status, corrected.cause, age))
+            self._note(Correction(*what, corrected.status, corrected.cause))
 
 
 def _without_cpu(end: Observation) -> Observation:

@@ -188,15 +188,11 @@ class Learning:
                 joint.chosen(record.primitive_task, record.context, record.action)
         elif isinstance(record, Credit) is not (self.credit == TASK):
             return
-        elif isinstance(record, RunEnd | Credit):
+        else:  # of a run that ended provisionally, a selector learns by its verdict
             selector.update(record.context, record.action, record.outcome)
             if joint is not None and record.context in selector.learners and not selector.frozen:
                 p = joint.marginal(record.primitive_task, record.context)
                 selector.learners[record.context].p[0] = p / p.sum()
-        elif record.was.status is not None:
-            selector.correct(
-                record.context, record.action, record.was.status, record.status, record.age
-            )
 
     # --- reading ------------------------------------------------------------------------------
 

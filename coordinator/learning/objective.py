@@ -27,7 +27,6 @@ from petrobot.coordinator.learning.statistics import (
     runs_needed,
     wilson,
 )
-from petrobot.coordinator.task import Status
 
 SURER = 1.2
 """Factor of the interval of a difference, for two J that are to be told apart. The intervals of R
@@ -59,7 +58,7 @@ class Figures:
 
     action: str
     runs: int
-    """Number of runs in all scenarios."""
+    """Number of judged runs in all scenarios."""
     reliability: float
     """R in the scenario that is hardest for the action; nan without any run."""
     lower: float
@@ -194,7 +193,7 @@ def admitted(
     return tuple(
         scenario
         for scenario, tally in sorted(by_scenario.items())
-        if tally.runs and (target is None or tally.interval(level)[0] >= target)
+        if tally.judged and (target is None or tally.interval(level)[0] >= target)
     )
 
 
@@ -228,7 +227,7 @@ def compare(actions: Mapping[str, Mapping[str, Tally]], question: Question) -> C
 
 def shared(actions: Mapping[str, Mapping[str, Tally]]) -> tuple[str, ...]:
     """Return the sorted scenarios in which every action that has runs was run."""
-    run = [{s for s, t in by.items() if t.runs} for by in actions.values()]
+    run = [{s for s, t in by.items() if t.judged} for by in actions.values()]
     return tuple(sorted(set.intersection(*known))) if (known := [s for s in run if s]) else ()
 
 
@@ -241,7 +240,7 @@ def _row(
     unmet: bool,
 ) -> Figures:
     """Return the figures of one action; J is filled in later, when the common rho is known."""
-    known = {s: t for s, t in by_scenario.items() if t.runs}
+    known = {s: t for s, t in by_scenario.items() if t.judged}
     worst = hardest(known, tuple(known))
     there = known[worst] if worst is not None else Tally()
     among = tuple(known) if unmet else inside
@@ -250,7 +249,7 @@ def _row(
     costs = {s: _mean_cost(known[s], question.measure, declared) for s in among}
     cost = costs[scenario] if scenario is not None else (inf if known else declared)
     largest = max((c for c in costs.values() if not isnan(c)), default=cost)
-    level, counts = question.level, [(t.count(Status.SUCCESS), t.runs) for t in known.values()]
+    level, counts = question.level, [(t.successes, t.judged) for t in known.values()]
     # The scenario of C is a choice among several as well, so its interval is as strict.
     strict = 1.0 - (1.0 - level) / max(1, len(known))
     spent = known[scenario].cost(question.measure) if scenario is not None else None
@@ -258,7 +257,7 @@ def _row(
     executed = whole.runs + whole.censored
     return Figures(
         action,
-        whole.runs,
+        whole.judged,
         there.reliability,
         *(lowest_share(counts, level) if counts else (0.0, 1.0)),
         worst,

@@ -461,7 +461,7 @@ def _scenarios(task: Task, estimates: Estimates) -> list[str]:
             where
             for by_context in estimates.of(name).values()
             for where, tally in by_context.items()
-            if tally.runs
+            if tally.judged
         }
         for name in task.primitive_tasks
     ]
@@ -605,7 +605,7 @@ def _moves(
         tally = reduce(
             Tally.merged, estimates.of(primitive, scenario).get(action, {}).values(), Tally()
         )
-        if not tally.runs or not known or found.visits.get((place, action), 0.0) <= 0:
+        if not tally.judged or not known or found.visits.get((place, action), 0.0) <= 0:
             continue
         own = known[Status.SUCCESS].share if Status.SUCCESS in known else 0.0
         step = -STEP if own > 0.5 else STEP

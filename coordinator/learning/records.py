@@ -3,7 +3,7 @@ task on choices, firings, and ends of trials."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ class RunEnd:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A deferred verdict replaces the status of a run that ended before."""
+    """A deferred verdict on a run that ended provisionally before."""
 
     primitive_task: str
     action: str
@@ -40,9 +40,11 @@ class Correction:
     was: Observation
     status: Status
     cause: str = ""
-    age: int = 0
-    """Trials of the primitive task in this context since that run ended. A rule whose sums fade
-    corrects less of an old trial."""
+
+    @property
+    def outcome(self) -> Observation:
+        """The run as it was judged."""
+        return replace(self.was, status=self.status, cause=self.cause, judged=True)
 
 
 @dataclass(frozen=True, slots=True)

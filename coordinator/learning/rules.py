@@ -518,22 +518,6 @@ class Tracking:
         gain = np.maximum(self.gain_floor, np.minimum(1.0, 1.0 / batch.k**self.exponent))
         batch.p += gain[:, None] * (one_hot(batch.best(eligible), batch.n) - batch.p)
 
-    def correcting(self, batch: Batch, action: int, change: float, age: int) -> float:
-        """Return how much of a corrected success is still in the faded sums, for the trial `age`
-        trials ago; one row only.
-
-        It is 0 for a trial before the last restart. The mean that the change test keeps since the
-        restart does not fade, so it is corrected in full.
-        """
-        # A restart sets k to 1, so after one the number of trials since then is k - 1.
-        since = batch.k[0] - (batch.own["restarts"][0, 0] > 0)
-        if age >= since:
-            return 0.0
-        seen, met = (batch.own[name][0] for name in ("seen", "seen_success"))
-        met[action] = min(max(0.0, met[action] + change), seen[action])
-        left: float = change * (1.0 - 1.0 / self.memory) ** age
-        return left
-
     def _alarm(self, batch: Batch, trial: Response) -> Mask:
         """Return the rows in which success or cost of the chosen action has left its mean since the
         restart."""

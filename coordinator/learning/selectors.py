@@ -2,7 +2,7 @@
 and the controls of the user.
 
 A selector chooses one of the alternatives and explains the choice with its numbers. It learns only
-from `chosen`, `update` and `correct`, so its state can be derived again from stored choices and
+from `chosen` and `update`, so its state can be derived again from stored choices and
 ends of runs.
 """
 
@@ -186,7 +186,7 @@ class RuleSelector:
             self._kept(context).choosing(np.array([self.actions.index(action)]))
 
     def update(self, context: str, action: str, outcome: Observation) -> None:
-        """Learn from a run that ended; a censored one teaches nothing."""
+        """Learn from a run that ended; one that is censored or not judged teaches nothing."""
         if self.frozen or not self.learns_from(action, outcome):
             return
         batch, missing = self._kept(context), _is_missing(outcome)
@@ -221,9 +221,9 @@ class RuleSelector:
             getattr(batch, name)[0] += weight * gain
 
     def learns_from(self, action: str, outcome: Observation) -> bool:
-        """Return whether a run is a trial: of one of the actions, and neither censored nor
+        """Return whether a run is a trial: of one of the actions, judged, and neither censored nor
         cancelled before it began."""
-        if action not in self.actions:
+        if action not in self.actions or not outcome.judged:
             return False
         return _is_missing(outcome) or (
             outcome.status is not None and outcome.executed is not Executed.NO
@@ -237,21 +237,6 @@ class RuleSelector:
         now = eligible(batch, self.question.target, before, self.question.level)
         batch.own["admitted"][:] = now
         return now
-
-    def correct(self, context: str, action: str, was: Status, status: Status, age: int = 0) -> None:
-        """Apply a deferred verdict on the run `age` trials ago: the sums change once, choices made
-        since then stay.
-
-        Only what the sums still contain of that run is corrected (a rule may fade or drop them),
-        and the number of successes stays between 0 and the number of runs.
-        """
-        if self.frozen or action not in self.actions:
-            return
-        change = float(status is Status.SUCCESS) - float(was is Status.SUCCESS)
-        batch, i = self._kept(context), self.actions.index(action)
-        if isinstance(self.rule, Tracking):
-            change = self.rule.correcting(batch, i, change, age)
-        batch.successes[0, i] = min(max(0.0, batch.successes[0, i] + change), batch.runs[0, i])
 
     def prime(
         self,
@@ -273,10 +258,10 @@ class RuleSelector:
             missing = sum(tally.not_executed.values())
             batch.runs[0, i] = batch.successes[0, i] = 0.0
             batch.cost[0, i] = batch.costed[0, i] = batch.squares[0, i] = 0.0
-            for seen, share in ((tally, 1.0), (before, min(1.0, trials / max(1, before.runs)))):
+            for seen, share in ((tally, 1.0), (before, min(1.0, trials / max(1, before.judged)))):
                 cost = seen.cost(self.question.measure)
-                batch.runs[0, i] += share * seen.runs
-                batch.successes[0, i] += share * seen.count(Status.SUCCESS)
+                batch.runs[0, i] += share * seen.judged
+                batch.successes[0, i] += share * seen.successes
                 batch.cost[0, i] += share * cost.total
                 batch.costed[0, i] += share * cost.n
                 batch.squares[0, i] += share * (cost.m2 + cost.n * cost.mean**2)

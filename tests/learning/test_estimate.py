@@ -142,9 +142,14 @@ def test_a_tally_survives_conversion_to_plain_data(seen: list[Observation]) -> N
 def test_a_deferred_verdict_changes_r_once(
     seen: list[Observation], deferred: Observation, status: Status
 ) -> None:
-    """The corrected tally counts as if the run had ended with the corrected status."""
+    """The corrected tally counts as if the run had ended with the corrected status. Before, the run
+    does not count in R."""
     assert deferred.status is not None
-    corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")
+    deferred = replace(deferred, judged=False)
+    before, alone = tally_of([*seen, deferred]), tally_of(seen)
+    assert (before.judged, before.successes) == (alone.judged, alone.successes)
+    assert before.runs == alone.runs + 1
+    corrected = before.correcting(deferred, status, "seen later")
     expected = tally_of(
         [
             *seen,
@@ -156,7 +161,8 @@ def test_a_deferred_verdict_changes_r_once(
         e: m.n for e, m in expected.durations.items()
     }
     assert corrected.corrected == (status is not deferred.status)
-    assert corrected.runs == expected.runs
+    assert corrected.runs == corrected.judged == expected.runs
+    assert corrected.reliability == expected.reliability
 
 
 def test_a_verdict_without_a_matching_run_is_refused() -> None:
@@ -309,9 +315,11 @@ def test_numbers_that_no_sequence_of_runs_can_produce_are_refused(
 def test_every_tally_of_real_runs_is_accepted(
     seen: list[Observation], deferred: Observation, status: Status, others: list[Observation]
 ) -> None:
-    """This includes corrected and merged tallies: the check refuses no valid tally."""
+    """This includes corrected and merged tallies, and those with runs that nobody has judged: the
+    check refuses no valid tally."""
+    deferred = replace(deferred, judged=False)
     corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")
-    tally = corrected.merged(tally_of(others, "other"))
+    tally = corrected.merged(tally_of([*others, deferred], "other"))
     assert Tally.of_plain(json.loads(json.dumps(tally.to_plain()))) == tally
 
 

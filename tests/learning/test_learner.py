@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from math import isnan
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -27,7 +28,6 @@ from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.records import (
     Choice,
-    Correction,
     Passage,
     RunEnd,
 )
@@ -211,8 +211,9 @@ def test_choices_of_the_user_and_the_operator_override_the_selector(task: Task) 
     assert selector.learning.selectors["pick"].learner("regime=A").runs[0, 1] == 4
 
 
-def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
-    """The engine reports it once; a second verdict, or one on another run, changes nothing."""
+def test_a_run_that_ended_provisionally_counts_in_r_when_it_is_judged(task: Task) -> None:
+    """Once: a second verdict, or one on another run, changes nothing. Before, it says only how it
+    ended."""
     selector = learner(task, seed=1)
     selector.settled(0.0, State((0,), {"regime": "A"}))
     selector.instruction(0.0, StartRun("pick#1", "pick", "pick", "pick_slow", {}, 5.0))
@@ -230,7 +231,9 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
     )
     selector.instruction(0.4, ended)
     key = TallyKey("pick", "pick_slow", "regime=A")
-    assert selector.learning.estimates.tally(key).reliability == 1.0
+    tally, batch = selector.learning.estimates.tally(key), selector.learning.selectors["pick"]
+    assert (tally.runs, tally.judged, tally.wall.n) == (1, 0, 1) and isnan(tally.reliability)
+    assert batch.learner("regime=A").runs[0, 1] == 0.0
     verdict = Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked")
     for correction in (
         verdict,
@@ -239,36 +242,9 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
     ):
         selector.instruction(1.0, correction)
     tally = selector.learning.estimates.tally(key)
-    assert (tally.reliability, tally.corrected, tally.runs) == (0.0, 1, 1)
-    assert selector.learning.selectors["pick"].learner("regime=A").successes[0, 1] == 0.0
-
-
-def test_a_deferred_verdict_has_the_number_of_trials_since(task: Task) -> None:
-    """It counts trials of its own primitive task and context; a cancelled run is not a trial."""
-    selector = learner(task, "tracking", seed=1)
-
-    def ended(
-        run: str, action: str, status: Status | None, place: str = "pick", regime: str = "A"
-    ) -> None:
-        selector.settled(0.0, State((0,), {"regime": regime}))
-        selector.instruction(0.0, StartRun(run, place, place, action, {}, 5.0))
-        record = RunRecorded(
-            run, place, place, action, status, "", "", Executed.YES, 0.4, deferred=run == "pick#1"
-        )
-        selector.instruction(0.4, record)
-
-    ended("pick#1", "pick_slow", Status.SUCCESS)
-    ended("pick#2", "pick_fast", Status.SUCCESS)
-    ended("pick#3", "pick_fast", Status.FAILURE)
-    ended("pick#4", "pick_fast", None)
-    ended("pick#5", "pick_fast", Status.SUCCESS, regime="B")
-    ended("place#1", "place_soft", Status.SUCCESS, "place")
-    selector.instruction(
-        1.0, Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked")
-    )
-    record = selector.records[-1]
-    assert isinstance(record, Correction)
-    assert record.age == 2
+    assert (tally.reliability, tally.corrected, tally.runs, tally.judged) == (0.0, 1, 1, 1)
+    learned = batch.learner("regime=A")
+    assert (learned.runs[0, 1], learned.successes[0, 1]) == (1.0, 0.0)
 
 
 def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -26,7 +27,6 @@ from petrobot.coordinator.learning.selectors import (
     make,
 )
 from petrobot.coordinator.task import Executed, Status
-from tests.waiting import Limit
 
 ACTIONS = ("a", "b", "c", "d")
 NAMES = sorted(RULES)
@@ -199,7 +199,6 @@ def test_a_frozen_selector_learns_nothing_and_a_reset_one_forgets_all(name: str)
     before = json.dumps(selector.state())
     selector.chosen("", "a")
     selector.update("", "a", success())
-    selector.correct("", "b", Status.SUCCESS, Status.FAILURE)
     assert json.dumps(selector.state()) == before
     assert "frozen" in selector.choose("", ACTIONS, np.random.default_rng(0))[1]
     selector.frozen = False
@@ -243,96 +242,33 @@ def test_first_trials_of_an_unavailable_action_end() -> None:
     assert "first 5" not in selector.choose("", ("dead",), np.random.default_rng(0))[1]
 
 
-def test_a_deferred_verdict_changes_the_sums() -> None:
-    """R falls and J rises; the choice probabilities follow with later trials."""
-    selector = taught(make("nikolic_fu", ACTIONS), good=10)
-    before = selector.objective("")["b"]
-    selector.correct("", "b", Status.SUCCESS, Status.FAILURE)
-    assert selector.objective("")["b"] == pytest.approx(before + 0.1)
-
-
-def test_a_late_verdict_changes_at_most_the_remaining_weight_of_its_run() -> None:
-    """After 300 trials of b the faded sums hold 0.37 of the only run of a: the correction takes
-    that weight, and R is 1, not 2.7."""
-    selector = make("tracking", ("a", "b"))
-    selector.update("", "a", failure())
-    for _ in range(300):
-        selector.update("", "b", success(0.5))
-    batch = selector.learner("")
-    left = batch.runs[0, 0]
-    assert left == pytest.approx((1 - 1 / 300) ** 300)
-    selector.correct("", "a", Status.FAILURE, Status.SUCCESS, 300)
-    assert batch.successes[0, 0] == pytest.approx(left)
-    assert batch.reliability()[0, 0] == pytest.approx(1.0)
-    assert selector.objective("")["a"] == pytest.approx(1.0)
-    assert min(selector.objective(""), key=selector.objective("").__getitem__) == "b"
-
-
-@pytest.mark.parametrize("age", [0, 1, 40])
-def test_a_verdict_fades_with_its_run(age: int) -> None:
-    """The sums are those of a run that ended with the corrected status."""
-
-    def learned(first: Observation) -> RuleSelector:
-        selector = make("tracking", ("a", "b"))
-        for outcome in (success(), success(), first):
-            selector.update("", "a", outcome)
-        for i in range(age):
-            selector.update("", "ab"[i % 2], failure())
-        return selector
-
-    corrected = learned(failure())
-    corrected.correct("", "a", Status.FAILURE, Status.SUCCESS, age)
-    for name in ("runs", "successes"):
-        assert getattr(corrected.learner(""), name) == pytest.approx(
-            getattr(learned(success()).learner(""), name)
-        )
-    own, expected = corrected.learner("").own, learned(success()).learner("").own
-    assert own["seen_success"] == pytest.approx(expected["seen_success"])
-
-
-def test_a_verdict_on_a_run_before_a_restart_changes_nothing() -> None:
-    """The run that caused the restart was forgotten with the earlier ones; the first run after it
-    can be corrected."""
-    selector = make("tracking", ("a", "b"))
-    trials, limit = 0, Limit("the alarm", steps=1000)
-    while not selector.learner("").own["restarts"][0, 0] and limit.left():
-        trials += 1
-        selector.update("", "a", success() if trials < 100 else failure())
-    for after in range(3):
-        before = selector.state()
-        for age in range(after, trials + after):
-            selector.correct("", "a", Status.FAILURE, Status.SUCCESS, age)
-        assert selector.state() == before
-        selector.update("", "a", failure())
-    selector.correct("", "a", Status.FAILURE, Status.SUCCESS, 2)
-    assert selector.learner("").successes[0, 0] == pytest.approx((1 - 1 / 300) ** 2)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_selector_does_not_learn_from_a_run_that_nobody_has_judged(name: str) -> None:
+    selector = taught(make(name, ACTIONS), good=3)
+    before = json.dumps(selector.state())
+    selector.update("", "a", replace(success(), judged=False))
+    assert json.dumps(selector.state()) == before
+    selector.update("", "a", success())
+    assert json.dumps(selector.state()) != before
 
 
 STEPS = st.lists(
-    st.tuples(
-        st.sampled_from("usmcr"), st.sampled_from(ACTIONS), st.integers(0, 60), st.integers(1, 60)
-    ),
+    st.tuples(st.sampled_from("usm"), st.sampled_from(ACTIONS), st.integers(1, 60)),
     max_size=25,
 )
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.sampled_from(NAMES), STEPS, st.sampled_from([None, 0.5, 0.9]))
-def test_shares_stay_within_bounds_after_any_corrections(
-    name: str, steps: list[tuple[str, str, int, int]], target: float | None
+def test_shares_stay_within_bounds(
+    name: str, steps: list[tuple[str, str, int]], target: float | None
 ) -> None:
-    """Trials, runs that never executed, verdicts of any age, and restarts: R, A and J stay in their
-    ranges."""
+    """Trials, runs that never executed, and restarts: R, A and J stay in their ranges."""
     selector = make(name, ACTIONS, Question("wall", target))
-    for what, action, age, times in steps:
+    for what, action, times in steps:
         for _ in range(times):
-            if what == "c":
-                selector.correct("", action, Status.FAILURE, Status.SUCCESS, age)
-            elif what == "r":
-                selector.correct("", action, Status.SUCCESS, Status.ERROR, age)
-            else:
-                outcome = {"u": failure(0.1 * times), "s": success(2.0), "m": missing()}[what]
-                selector.update("", action, outcome)
+            outcome = {"u": failure(0.1 * times), "s": success(2.0), "m": missing()}[what]
+            selector.update("", action, outcome)
         again = make(name, ACTIONS, Question("wall", target))
         again.restore(json.loads(json.dumps(selector.state())))
         selector = again

@@ -29,7 +29,8 @@ TRULY = {
     "pick#5": (OK, ""),
     "pick#6": (OK, ""),
 }
-"""The final outcome of each pick. The last one is never judged, so its own result counts."""
+"""The final outcome of each pick. The last one is never judged: it keeps its own result, which does
+not count in R, and no selector learns from it."""
 
 
 def sorting() -> Task:
@@ -93,7 +94,7 @@ def learned(selector: LearningSelector) -> dict[str, tuple[dict[Any, int], int, 
 
 LEARNED = {
     "pick_left": ({("failure", "crooked"): 1, ("failure", "fell"): 1, ("success", ""): 1}, 2, 1),
-    "pick_right": ({("failure", "crooked"): 1, ("success", ""): 2}, 1, 2),
+    "pick_right": ({("failure", "crooked"): 1, ("success", ""): 2}, 1, 1),
 }
 
 

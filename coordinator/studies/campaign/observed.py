@@ -54,6 +54,7 @@ def observation(task: Task, run: RunEntry) -> Observation:
         {} if run.cancelled else run.values,
         run.taken if run.cancelled else None,
         None if run.cancelled else max(0.0, round(run.took - run.seconds, 6)),
+        run.judged,
     )
 
 

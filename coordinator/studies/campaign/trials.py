@@ -66,6 +66,8 @@ class RunEntry:
     waited: float | None = None
     """How much of `took` had passed when it was started: the wait for the run before it, for a
     choice and for its device. None: not known, as in tables that are older than this."""
+    judged: bool = True
+    """False: its status is provisional, and nobody has judged it (not known in older tables)."""
 
     def to_plain(self) -> list[Any]:
         """Return a list in the order of the fields."""
@@ -288,6 +290,7 @@ class TrialLog:
         entry.status = record.status.value if record.status is not None else ""
         entry.cause = record.cause if record.status is not Status.SUCCESS else ""
         entry.text, entry.cancelled = record.text, record.cancelled
+        entry.judged = not record.deferred
         entry.executed, entry.seconds = record.executed.value, round(record.seconds, DIGITS)
         entry.values = _numbers(values)
         cost = self._cost_of(record, values)
@@ -301,6 +304,7 @@ class TrialLog:
         trial, entry = self._entries[corrected.run]
         entry.status, entry.text = corrected.status.value, corrected.text or entry.text
         entry.cause = corrected.cause if corrected.status is not Status.SUCCESS else ""
+        entry.judged = True
         worst = max(self._ends[trial.k], key=lambda one: _RANK[one.status])
         bad = _RANK[worst.status] > _RANK[Status.SUCCESS.value]
         trial.status, trial.cause = (

@@ -177,7 +177,7 @@ def action_pictures(task: Task, estimates: Estimates) -> Pictures:
         known = [
             (k, t)
             for k, t in sorted(estimates.tallies.items())
-            if k.primitive_task == primitive.name and t.runs
+            if k.primitive_task == primitive.name and t.judged
         ]
         reliability = [_reliability(key, tally) for key, tally in known]
         cost = [
