@@ -342,6 +342,8 @@ def test_a_preempting_event_is_a_cause_of_end_not_an_independent_race() -> None:
     )
     measured = measured_from(task, estimates)
     assert measured.preempted["place", "place_soft"]["jammed"].share == pytest.approx(0.93)
+    few = forecast(stochastic_view(task, measured)).approximations
+    assert any(text.startswith("place.place_soft.by.jammed: ") for text in few)
     found = forecast(stochastic_view(task, measured, stages=30))
     assert found.firings["jammed"] == pytest.approx(0.93, abs=1e-9)
     mean = 0.02 + 0.4 + 0.93 * measured.preempted["place", "place_soft"]["jammed"].mean + 0.07 * 1.2
@@ -378,6 +380,27 @@ def test_causes_leave_no_tokens_behind() -> None:
     )
     assert found.done.goal.any()
     assert not np.any(dirty & found.done.goal)
+
+
+def test_ends_at_the_deadline_are_known_by_their_cause() -> None:
+    """They come at the deadline, later by the wait that was seen; runs that never began are errors,
+    too. Nothing measured is taken for a declared estimate, though older files do not know which
+    cause came with runs that may not have been executed."""
+    out = Tally(unknown=1)
+    for seconds, cause, executed in (
+        (1.0, "slip", Executed.YES),
+        (9.0, "deadline", Executed.YES),
+        (9.0, "deadline", Executed.YES),
+        (0.0, "unreachable", Executed.NO),
+    ):
+        seen = Observation(Status.ERROR, seconds, cause, executed, waited=0.5)
+        out = out.adding(seen, "x")
+    task = series(1)
+    known = replace(task.primitive_tasks["a"], deadline=9.0)
+    task = replace(task, primitive_tasks={"a": known})
+    measured = measured_from(task, Estimates({TallyKey("a", "do_a"): out}))
+    assert measured.late == {("a", "do_a"): Estimate(0.5, 9.5, 0.0)}
+    assert not measured.expected and measured.mixed == {("a", "do_a")}
 
 
 def test_an_aborted_run_is_censored() -> None:
