@@ -4,7 +4,7 @@ cause, and the sorting task."""
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp, hypot
+from math import exp, hypot, sqrt
 
 import numpy as np
 import pytest
@@ -24,7 +24,8 @@ from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question, compare
 from petrobot.coordinator.learning.propagation import incidences, measured_from, propagate
 from petrobot.coordinator.studies.forecast.registered import exact
-from petrobot.coordinator.task import Estimate, Executed, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, Output, Place, Status, Task
+from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
 from tests.learning.cell import run, sorting
 
@@ -255,6 +256,27 @@ def test_the_forecast_and_learned_task_use_the_measured_causes() -> None:
     found = exact(task, estimates, "", {"a": {"do_a": 1.0}})
     assert found["R_goal"] == pytest.approx(0.2, rel=1e-4), found
     assert propagate(task, estimates).forecast.goal_reliability == pytest.approx(0.2, rel=1e-4)
+
+
+@pytest.mark.parametrize("cv", [0.0, 0.45, 1.5])
+def test_the_interval_of_p_complete_does_not_depend_on_the_duration(cv: float) -> None:
+    """150 of 200 runs succeed, the others end the task; a duration may have two branches."""
+    random, known = np.random.default_rng(3), Tally()
+    for i in range(200):
+        seconds = float(random.gamma(1 / cv**2, 2 * cv**2)) if cv else 2.0
+        status = Status.SUCCESS if i < 150 else Status.ERROR
+        known = known.adding(Observation(status, seconds, "why" * (i >= 150)))
+    task = series(1)
+    lost = replace(task.transitions["a_failed"], outputs=(Output("lost"),))
+    task = replace(
+        task,
+        places={**task.places, "lost": Place("lost", Kind.CONTROL)},
+        transitions={**task.transitions, "a_failed": lost},
+        final_error=parse("lost == 1"),
+    )
+    found = exact(task, Estimates({TallyKey("a", "do_a"): known}), "", {"a": {"do_a": 1.0}})
+    half = 1.96 * sqrt(0.25 / 0.75 / 200)
+    assert found["P_complete_interval"] == pytest.approx([0.75 * exp(-half), 0.75 * exp(half)])
 
 
 def test_executed_unknown_is_kept_by_cause() -> None:
