@@ -40,7 +40,12 @@ from petrobot.coordinator.analysis.time.simulate import (
     simulate,
 )
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME
+from petrobot.coordinator.analysis.time.task_forecast import (
+    MATTERS,
+    TIME,
+    rough_fits,
+    timer_shares,
+)
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
     change_gspn,
@@ -429,20 +434,20 @@ def simulate_command(
 def _rough(view: StochasticView, seen: Simulation, stages: int) -> list[str]:
     """Return, as a note, which durations have too few phases for quantiles of the time: error times
     share of the time, as for the exact solution."""
-    phases = {f"{p}.{a}.{s}": f"{p}.{s}." for p, a, s in view.statuses.values()}
-    rough = {}
-    for key, error in view.fit_errors.items():
-        if key in phases:
-            tokens = [one for p, one in seen.mean_tokens.items() if p.startswith(phases[key])]
-            share = sum(one.mean for one in tokens)
-        elif ".by." in key:  # until the run is preempted
-            share = seen.mean_tokens[key.partition(".by.")[0].rpartition(".")[0]].mean
-        else:
-            timer = view.task.transitions[key.rpartition(".")[0]]
-            cases = [case for case, name in view.origin.items() if name == timer.name]
-            share = sum(seen.throughput[case].mean for case in cases) * (timer.after or 0.0)
-        if abs(error) * share >= MATTERS:
-            rough[key] = error
+    net, fired = view.gspn.net, dict[str, float]()
+    chains: dict[str, set[str]] = {}
+    """By duration: the chains of phases that it has, also those that it shares."""
+    for label, (key, _, _) in view.begins.items():
+        given = {net.places[p] for p, _ in net.produce[net.transition_index[label]]}
+        chains.setdefault(key, set()).update(view.chains[p] for p in given & set(view.chains))
+    shares = {
+        key: sum(seen.mean_tokens[p].mean for p, chain in view.chains.items() if chain in own)
+        for key, own in chains.items()
+    }
+    for case, name in view.origin.items():
+        fired[name] = fired.get(name, 0.0) + seen.throughput[case].mean
+    found = rough_fits(view.fit_errors, shares | timer_shares(view, fired))
+    rough = {key: error for key, error, _ in found}
     most = 100 * max(rough.values(), key=abs, default=0.0)
     few = f"off by up to {most:+.0f} %, because a duration has at most {stages} phases"
     return [f"approximated: the 90 % quantile of {', '.join(rough)} is {few}"] if rough else []

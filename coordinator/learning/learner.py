@@ -132,6 +132,9 @@ class _Trial:
     """The verdict; None while there is none."""
     back: bool = False
     """Every token is back."""
+    completed: bool = False
+    """The task could take the next token; the trial is counted when no preempted run of it is still
+    being stopped."""
     seconds: float = 0.0
     context: str = ""
     """The context in which it began."""
@@ -338,6 +341,8 @@ class LearningSelector(FirstAlternative):
             if trial.met is not None and trial.runs[-1][:3] not in known:
                 # Its node was slow to say that it ended.
                 self._credit(trial, trial.runs[-1:], late=True)
+            if trial.completed:
+                self._count_if_stopped(trial)
 
     # --- the task's verdict on choices --------------------------------------------------------
 
@@ -352,7 +357,8 @@ class LearningSelector(FirstAlternative):
                 self._judge(now, trial, True)  # otherwise nobody can say whether it met the goal
             if not self._tokens.on_its_way(trial.number):
                 # The task could take the next token, so this one is completed.
-                self._count(trial, True)
+                trial.completed = True
+                self._count_if_stopped(trial)
         self._open[number] = _Trial(number, now, context=self.context)
 
     def _pass(self, now: float, fired: Fired) -> None:
@@ -379,9 +385,16 @@ class LearningSelector(FirstAlternative):
                 self._judge(now, trial, trial.goals > 0 or not self._goals)
             elif trial.met is None and gave_up:
                 self._judge(nan, trial, False)
-            if success or trial.back or trial.goals or trial.number in lost:
+            if success or trial.completed or trial.back or trial.goals or trial.number in lost:
                 met = trial.back or (bool(trial.goals) and trial.number not in lost)
-                self._count(trial, success or met)
+                self._count(trial, success or trial.completed or met)
+
+    def _count_if_stopped(self, trial: _Trial) -> None:
+        """Record a completed trial, unless a run of it that was preempted is still being stopped:
+        its cost and its status count, too."""
+        stopping = (r for r, served in self._served.items() if served is trial)
+        if trial.number in self._open and not any(self._active[r].taken_by for r in stopping):
+            self._count(trial, True)
 
     def _count(self, trial: _Trial, completed: bool) -> None:
         """Record what a trial of the task came to, as campaigns count it."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.ordinary import contended
-from petrobot.coordinator.analysis.time.measured import Ending, Measured, is_cause
+from petrobot.coordinator.analysis.time.measured import LATE, Ending, Measured, is_cause
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
@@ -126,6 +126,7 @@ def measured_from(
     often: dict[str, dict[str, float]] = {}
     causes: dict[tuple[str, str], dict[Status, dict[Ending, float]]] = {}
     mixed = set[tuple[str, str]]()
+    late: dict[tuple[str, str], Estimate] = {}
     for place in task.flat.places.values():
         if place.kind is not Kind.ACTION:
             continue
@@ -141,7 +142,12 @@ def measured_from(
             often.setdefault(place.task, {})[action] = float(started)
             key = (place.name, action)
             waits_in_view = (devices or {}).get(action, "") in held
-            runs[key], preempted[key] = _ends(tally, takers, 0.0 if waits_in_view else None)
+            extra = 0.0 if waits_in_view or not tally.waited.n else tally.waited.mean
+            runs[key], preempted[key] = _ends(tally, takers, extra)
+            errors = causes[place.task, action][Status.ERROR]
+            if at_deadline := added(n for (cause, _), n in errors.items() if cause == LATE[0]):
+                deadline = min(task.primitive_task_of(place.name).deadline, place.timeout or inf)
+                late[key] = Estimate(at_deadline / added(errors.values()), deadline + extra, 0.0)
             sources[key] = _source(tally, (kinds or {}).get((place.task, action), {}))
             if not takers:
                 del preempted[key]
@@ -153,7 +159,8 @@ def measured_from(
         preempted,
         sources,
         causes,
-        frozenset(mixed),
+        late=late,
+        mixed=frozenset(mixed),
     )
 
 
@@ -199,13 +206,11 @@ def _preempting(task: Task, place: str) -> set[str]:
 
 
 def _ends(
-    tally: Tally, takers: set[str], extra: float | None
+    tally: Tally, takers: set[str], extra: float
 ) -> tuple[dict[Status, Estimate], dict[str, Estimate]]:
     """Return the duration distributions of a run's own ends by status, and of its preemptions by
-    transition. Its own ends come `extra` s later; by default as long as it was seen to wait."""
+    transition. Its own ends come `extra` s later."""
     causes = {exit_: _cause(exit_, takers) for exit_ in tally.durations}
-    if extra is None:
-        extra = tally.waited.mean if tally.waited.n else 0.0
     ends = _exact(tally, causes) if None not in causes.values() else _incident(tally, causes)
     own = {
         Status(c): Estimate(

@@ -225,8 +225,7 @@ def seeded(*told: str, cell: str = CELL, **changes: Mapping[str, Any]) -> Case:
 
 STUCK |= {
     "a resource is not given back": seeded(
-        "next needs camera, which is empty: taken by `next`, never returned by `seen`, `grasped`, "
-        "`placed`",
+        "next needs camera, which is empty: taken by `next`, never returned by `seen`",
         seen={"out": "grasp"},
     ),
     "an error branch gives back only one of two": seeded(
@@ -244,7 +243,7 @@ STUCK |= {
         placed={"out": "arm*2 done"},
     ),
     "a preempt arc loses the arm": seeded(
-        "next needs arm, which is empty: taken by `next`, never returned by `seen`, `stop`",
+        "next needs arm, which is empty: taken by `next`, never returned by `stop`",
         stop={"in": "grasp:preempt=none", "event": "bell"},
     ),
     "an inhibitor looks at the wrong place": seeded(
@@ -255,8 +254,7 @@ STUCK |= {
         cell=CELL.replace("done", "done/2"),
     ),
     "a flag is not set again": seeded(
-        "next needs ready, which is empty: taken by `next`, never returned by `seen`, `grasped`, "
-        "`placed`",
+        "next needs ready, which is empty: taken by `next`, never returned by `placed`",
         cell=f"{CELL} ready=1",
         next={"in": "parts arm camera ready"},
         unseen={"out": "arm camera parts ready"},

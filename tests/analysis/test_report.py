@@ -454,7 +454,7 @@ put = { in = ["held"], after = 2.0 }
         for text in simulate_command(path, np.random.default_rng(1), replicas=100).data["notes"]
         if text.startswith("approximated")
     ]
-    assert "the 90 % quantile of grip.grip.success, put.after is off by up to +16 %" in note
+    assert "the 90 % quantile of put.after, grip.grip.success is off by up to +16 %" in note
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, execut
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import analyse
-from petrobot.coordinator.analysis.time.measured import Measured, Numbers, cut
+from petrobot.coordinator.analysis.time.measured import Measured, Numbers, RunEnd, cut
 from petrobot.coordinator.analysis.time.simulate import goal_by_marking, simulate
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
@@ -952,6 +952,62 @@ def test_what_is_left_of_a_duration_up_to_its_deadline(
     ended = found[Status.ERROR]
     assert ended.share == pytest.approx(0.2 + late)
     assert ended.mean * ended.share == pytest.approx(0.2 * 0.5 + late * deadline)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_ends_at_the_deadline_have_its_fixed_time(measured: bool) -> None:
+    """Exact times and many phases keep them apart; few phases cannot, and the view says so."""
+    task = with_deadline(1.0, 1, told=True)
+    place, known = task.places["work"], Measured()
+    estimates = Numbers(task, known).estimates(place, "work_a")
+    late = Numbers(task, known).ends(place, "work_a")[RunEnd(Status.ERROR, True)]
+    if measured:
+        key, part = ("work", "work_a"), late.share / estimates[Status.ERROR].share
+        runs, ends = {key: estimates}, {key: replace(late, share=part)}
+        causes = {("deadline", "yes"): 100 * part, ("slip", "yes"): 100 * (1 - part)}
+        known = Measured(runs, late=ends, causes={key: {Status.ERROR: causes}})
+    numbers = Numbers(task, known)
+    found = numbers.ends(place, "work_a")
+    own, late = found[RunEnd(Status.ERROR)], found[RunEnd(Status.ERROR, True)]
+    assert (late.mean, late.cv) == (1.0, 0.0) and own.mean < 1.0
+    pooled = estimates[Status.ERROR]
+    for power in (0, 1, 2):
+        moments = [
+            e.share * e.mean**power * (1 + (e.cv**2 if power == 2 else 0))
+            for e in (own, late, pooled)
+        ]
+        assert moments[0] + moments[1] == pytest.approx(moments[2]), power
+    examples = [("deadline", "yes"), ("slip", "yes")]
+    for end, cause in ((RunEnd(Status.ERROR, True), "deadline"), (RunEnd(Status.ERROR), "slip")):
+        assert numbers.endings(place, "work_a", end, examples, lambda e: e[0]) == {cause: 1.0}
+    text = "of its ends with ERROR come at its deadline"
+    few, many = stochastic_view(task, known), stochastic_view(task, known, stages=64)
+    assert any(text in a for a in few.assumptions) and not any(text in a for a in many.assumptions)
+    assert "work.work_a.error late" in many.fit_errors
+    chain, _, view = in_both(execute(task), known)
+    assert view.figures == pytest.approx(chain.figures, rel=1e-9)
+
+
+def test_no_run_outlasts_its_deadline_with_exact_times() -> None:
+    """A timer after the deadline never comes first. With few phases it does."""
+    text = Text(1)
+    text.places.append("broken = { }\n")
+    text.moves = [
+        arcs("bad", "work:error", "arm"),
+        arcs("slow", "work:preempt=none", "broken", ", after = 1.1"),
+    ]
+    text.final_error = 'final_error = "broken == 1"'
+    task = text.task()
+    ends = {Status.SUCCESS: Estimate(0.5, 9.0, 0.0), Status.ERROR: Estimate(0.5, 0.2, 0.0)}
+    work = replace(task.primitive_tasks["work"], estimates=ends)
+    task = replace(
+        task,
+        primitive_tasks={**task.primitive_tasks, "work": work},
+        places={**task.places, "work": replace(task.places["work"], timeout=1.0)},
+    )
+    x = execute(task)
+    assert played(x).figures["P_complete"] == (1.0, 0.0)
+    assert chain_of(x).figures["P_complete"] < 0.95
 
 
 def test_measured_durations_hold_their_deadlines_already() -> None:

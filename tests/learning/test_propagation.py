@@ -4,7 +4,7 @@ cause, and the sorting task."""
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp, hypot
+from math import exp, hypot, sqrt
 
 import numpy as np
 import pytest
@@ -24,7 +24,8 @@ from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question, compare
 from petrobot.coordinator.learning.propagation import incidences, measured_from, propagate
 from petrobot.coordinator.studies.forecast.registered import exact
-from petrobot.coordinator.task import Estimate, Executed, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, Output, Place, Status, Task
+from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
 from tests.learning.cell import run, sorting
 
@@ -257,6 +258,27 @@ def test_the_forecast_and_learned_task_use_the_measured_causes() -> None:
     assert propagate(task, estimates).forecast.goal_reliability == pytest.approx(0.2, rel=1e-4)
 
 
+@pytest.mark.parametrize("cv", [0.0, 0.45, 1.5])
+def test_the_interval_of_p_complete_does_not_depend_on_the_duration(cv: float) -> None:
+    """150 of 200 runs succeed, the others end the task; a duration may have two branches."""
+    random, known = np.random.default_rng(3), Tally()
+    for i in range(200):
+        seconds = float(random.gamma(1 / cv**2, 2 * cv**2)) if cv else 2.0
+        status = Status.SUCCESS if i < 150 else Status.ERROR
+        known = known.adding(Observation(status, seconds, "why" * (i >= 150)))
+    task = series(1)
+    lost = replace(task.transitions["a_failed"], outputs=(Output("lost"),))
+    task = replace(
+        task,
+        places={**task.places, "lost": Place("lost", Kind.CONTROL)},
+        transitions={**task.transitions, "a_failed": lost},
+        final_error=parse("lost == 1"),
+    )
+    found = exact(task, Estimates({TallyKey("a", "do_a"): known}), "", {"a": {"do_a": 1.0}})
+    half = 1.96 * sqrt(0.25 / 0.75 / 200)
+    assert found["P_complete_interval"] == pytest.approx([0.75 * exp(-half), 0.75 * exp(half)])
+
+
 def test_executed_unknown_is_kept_by_cause() -> None:
     """All 20 jams are unknown and no slip is. A file that has only their number shares it."""
     known = of_causes((20, "jam", Executed.UNKNOWN), (10, "slip", Executed.YES))
@@ -342,6 +364,8 @@ def test_a_preempting_event_is_a_cause_of_end_not_an_independent_race() -> None:
     )
     measured = measured_from(task, estimates)
     assert measured.preempted["place", "place_soft"]["jammed"].share == pytest.approx(0.93)
+    few = forecast(stochastic_view(task, measured)).approximations
+    assert any(text.startswith("place.place_soft.by.jammed: ") for text in few)
     found = forecast(stochastic_view(task, measured, stages=30))
     assert found.firings["jammed"] == pytest.approx(0.93, abs=1e-9)
     mean = 0.02 + 0.4 + 0.93 * measured.preempted["place", "place_soft"]["jammed"].mean + 0.07 * 1.2
@@ -378,6 +402,27 @@ def test_causes_leave_no_tokens_behind() -> None:
     )
     assert found.done.goal.any()
     assert not np.any(dirty & found.done.goal)
+
+
+def test_ends_at_the_deadline_are_known_by_their_cause() -> None:
+    """They come at the deadline, later by the wait that was seen; runs that never began are errors,
+    too. Nothing measured is taken for a declared estimate, though older files do not know which
+    cause came with runs that may not have been executed."""
+    out = Tally(unknown=1)
+    for seconds, cause, executed in (
+        (1.0, "slip", Executed.YES),
+        (9.0, "deadline", Executed.YES),
+        (9.0, "deadline", Executed.YES),
+        (0.0, "unreachable", Executed.NO),
+    ):
+        seen = Observation(Status.ERROR, seconds, cause, executed, waited=0.5)
+        out = out.adding(seen, "x")
+    task = series(1)
+    known = replace(task.primitive_tasks["a"], deadline=9.0)
+    task = replace(task, primitive_tasks={"a": known})
+    measured = measured_from(task, Estimates({TallyKey("a", "do_a"): out}))
+    assert measured.late == {("a", "do_a"): Estimate(0.5, 9.5, 0.0)}
+    assert not measured.expected and measured.mixed == {("a", "do_a")}
 
 
 def test_an_aborted_run_is_censored() -> None:

@@ -183,3 +183,35 @@ def test_a_finished_mission_loses_what_its_final_error_looks_at() -> None:
         assert tokens.fired(Fired(1, "start", net.initial, tuple(after), "begin")) == 1
         assert tokens.on_its_way(1) and tokens.of("load#1") == 1
         assert tokens.lost(Finished(status, "aborted")) == expected
+
+
+TUG = """
+schema = 1
+[task]
+name = "tug"
+final = "rack == 0 and hand == 1"
+runs_place = "rack"
+[primitive_tasks]
+pull = { deadline = 3.0 }
+watch = { deadline = 9.0 }
+[places]
+rack = { kind = "control", tokens = 1 }
+hand = { kind = "resource", tokens = 1 }
+pull = { kind = "action" }
+watch = { kind = "action" }
+[transitions]
+start = { in = ["rack", "hand"], out = ["pull", "watch"] }
+pulled = { in = ["pull:normal", "watch:preempt=failure"], out = ["hand"] }
+"""
+"""The next part begins in the step that preempts the watch, before the watch has stopped."""
+
+
+def test_a_preempted_run_counts_in_its_trial_after_the_next_one_has_begun() -> None:
+    """Its cost and its FAILURE are those of the trial that started it, as in a campaign."""
+    task = loads(TUG, "tug.toml")
+    trials, ends = played(task, 5, {"pull": [run(0.5)], "watch": [run(4.0)]})
+    assert [(end.success, end.runs) for end in ends] == [(False, ("pull", "watch"))] * 5
+    assert [trial.all_success for trial in trials] == [False] * 5
+    costs = [sum(entry.cost or 0.0 for entry in trial.runs) for trial in trials]
+    # to a tick: to the learner a preempted run lasts from its token's coming to its being taken
+    assert [end.cost for end in ends] == pytest.approx(costs, abs=0.01) and min(costs) > 0.9

@@ -352,7 +352,7 @@ def _since(net: Net, firings: tuple[str, ...], place: int) -> list[int]:
 
 def _held(net: Net, draft: Draft, since: list[int]) -> list[int]:
     """Return the marked places at which the tokens are that the first firing took."""
-    return [p for p in sorted(_carried(net, since)[1]) if draft.marking[p]] if since else []
+    return [p for p in sorted(_carried(net, since)[-1][1]) if draft.marking[p]] if since else []
 
 
 def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
@@ -370,15 +370,16 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     taker = f"taken by `{net.transitions[since[0]]}`"
     if not givers:
         return f"{taker}, and no transition returns it"
-    movers, carried = _carried(net, since)
+    steps = _carried(net, since)
     held = [net.places[p] for p in _held(net, draft, since)]
-    names = ", ".join(f"`{net.transitions[t]}`" for t in dict.fromkeys(movers))
-    if not _leads(net, carried, set(givers), place):
-        if movers:
-            return f"{taker}, never returned by {names}"
-        return f"{taker}, and nothing that follows it returns it"
+    for i, (mover, carried) in enumerate(steps):
+        # firings before this one could still lead to a giver, and later ones cannot help
+        if not _leads(net, carried, set(givers), place):
+            if i:
+                return f"{taker}, never returned by `{net.transitions[mover]}`"
+            return f"{taker}, and nothing that follows it returns it"
     where = f"still held with {' and '.join(held)}" if held else f"to be returned by {back}"
-    return f"{taker}, not returned by {names}; {where}" if movers else f"{taker}, {where}"
+    return f"{taker}, {where}"
 
 
 def _elsewhere(net: Net, order: list[int], givers: list[int]) -> str:
@@ -396,19 +397,19 @@ def _elsewhere(net: Net, order: list[int], givers: list[int]) -> str:
     return ""
 
 
-def _carried(net: Net, order: list[int]) -> tuple[list[int], set[int]]:
-    """Follow the tokens that the first firing produced through the later firings. Return the
-    firings that moved some of them, and the places that they reached. Places that have tokens at
-    the beginning, such as other resources, are not followed: a token that arrives there was
-    returned."""
+def _carried(net: Net, order: list[int]) -> list[tuple[int, set[int]]]:
+    """Follow the tokens that the first firing produced through the later firings. Return the first
+    firing and those that moved some of them, each with the places where they are after it. Places
+    that have tokens at the beginning, such as other resources, are not followed: a token that
+    arrives there was returned."""
     given = [{p for p, _ in arcs if not net.initial[p]} for arcs in net.produce]
-    movers, carried = list[int](), given[order[0]]
+    steps = [(order[0], given[order[0]])]
     for t in order[1:]:
+        carried = steps[-1][1]
         taken = {p for p, _ in net.consume[t]} & carried
         if taken and taken != given[t] & taken:
-            movers.append(t)
-            carried = (carried - taken) | given[t]
-    return movers, carried
+            steps.append((t, (carried - taken) | given[t]))
+    return steps
 
 
 def _leads(net: Net, places: set[int], givers: set[int], filled: int) -> bool:

@@ -38,6 +38,7 @@ from petrobot.coordinator.analysis.time.measured import (
     Measured,
     NoEstimate,
     Numbers,
+    RunEnd,
     is_cause,
 )
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
@@ -269,7 +270,7 @@ class _Builder:
     def __init__(self, x: ExecutionGraph, measured: Measured, size: int) -> None:
         self.x, self.measured, self.size = x, measured, size
         self.task = x.engine.compiled.task
-        self.numbers = Numbers(self.task, measured)
+        self.numbers = Numbers(self.task, measured, apart=not size)  # 0: with undivided clocks
         self.refuse_unknown()
         self.plans: dict[int, _Plan] = {}
         self.causes = {
@@ -499,8 +500,8 @@ class _Builder:
         for action, chosen in self.numbers.alternatives(place).items():
             if devices.get(action, "") != run.device:
                 continue
-            own = self.numbers.estimates(place, action).items()
-            ends = {self.what(place, s, action): e for s, e in own}
+            own = self.numbers.ends(place, action).items()
+            ends = {self.what(place, end, action): e for end, e in own}
             if self._covered(place.name):
                 caused = self.measured.preempted[place.name, action]
                 ends |= {f"by.{name}": e for name, e in caused.items()}
@@ -512,11 +513,11 @@ class _Builder:
                     found.append((chosen * e.share, what, duration))
         return found
 
-    def what(self, place: Place, status: Status, action: str) -> str:
-        """Return what a clock of a run says: its status, and its action if that tells why."""
+    def what(self, place: Place, end: RunEnd, action: str) -> str:
+        """Return what a clock of a run says: how it ends, and its action if that tells why."""
         actions = self._actions(place.name)
-        causes = [self.numbers.causes(place, a).get(status, {}) for a in actions]
-        return str(status) if all(c == causes[0] for c in causes) else f"{status} {action}"
+        causes = [self.numbers.causes(place, a).get(end.status, {}) for a in actions]
+        return str(end) if all(c == causes[0] for c in causes) else f"{end} {action}"
 
     def _actions(self, place: str) -> list[str]:
         return list(self.numbers.alternatives(self.task.places[place]))
@@ -606,9 +607,10 @@ class _Builder:
             assert run is not None
             place = self.task.places[run.place]
             for action in self._actions(place.name):
-                key = number["run", name], self.what(place, status, action)
-                if key not in ends and self.occurs(place, action, status):
-                    ends[key] = self.shares(place, action, status, given)
+                for end in self.numbers.ends(place, action):
+                    key = number["run", name], self.what(place, end, action)
+                    if end.status is status and key not in ends:
+                        ends[key] = self.shares(place, action, end, given)
         return _Plan(slots, (), ends, events)
 
     def event(
@@ -677,15 +679,10 @@ class _Builder:
         mine = devices.get(action, "")
         return sum(p for other, p in shares.items() if devices.get(other, "") == mine)
 
-    def occurs(self, place: Place, action: str, status: Status) -> bool:
-        """Return whether runs of an action end with a status."""
-        estimate = self.numbers.estimates(place, action).get(status)
-        return estimate is not None and estimate.share > 0
-
     def shares(
-        self, place: Place, action: str, status: Status, given: list[tuple[RunEnded, _Outcome]]
+        self, place: Place, action: str, end: RunEnd, given: list[tuple[RunEnded, _Outcome]]
     ) -> list[_Outcome]:
-        """Return the outcomes of a run that ends with one status, with their shares.
+        """Return the outcomes of a run that ends in one way, with their shares.
 
         Each cause has its own; results that are left have shares by the measured frequencies of the
         conditions, else equal ones.
@@ -700,11 +697,11 @@ class _Builder:
             return tuple(map(self.x.names.region, names, ending))
 
         by_kind: dict[tuple[Hashable, ...], list[_Outcome]] = {}
-        for end, outcome in given:
-            by_kind.setdefault(kind((end.cause, str(end.executed))), []).append(outcome)
-        examples = [(end.cause, str(end.executed)) for end, _ in given]
+        examples = [(one.cause, str(one.executed)) for one, _ in given]
+        for ending, (_, outcome) in zip(examples, given, strict=True):
+            by_kind.setdefault(kind(ending), []).append(outcome)
         found: list[_Outcome] = []
-        for some, part in self.numbers.endings(place, action, status, examples, kind).items():
+        for some, part in self.numbers.endings(place, action, end, examples, kind).items():
             drawn = self.drawn_results(place, by_kind[some])
             found += [replace(o, share=o.share * part) for o in drawn]
         return found

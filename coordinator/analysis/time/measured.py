@@ -8,9 +8,9 @@ assume the same, and say it in the same words.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, sqrt
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from petrobot.coordinator.task import (
     End,
@@ -61,9 +61,22 @@ class Measured:
     )
     expected: frozenset[tuple[str, str]] = frozenset()
     """Keys of `runs` with a declared estimate that was changed, which no run was measured for."""
+    late: Mapping[tuple[str, str], Estimate] = field(default_factory=dict)
+    """By keys of `runs`: the share of the ends with ERROR that came at the deadline, and when (s).
+    """
     mixed: frozenset[tuple[str, str]] = frozenset()
     """Keys of `causes` where each cause was given the same share of runs that are not known to have
     been executed, because only their number over all causes was measured."""
+
+
+class RunEnd(NamedTuple):
+    """How a run ends by itself: its status, and whether its deadline ends it."""
+
+    status: Status
+    late: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.status}{' late' if self.late else ''}"
 
 
 NEVER = 1e-6
@@ -71,6 +84,7 @@ NEVER = 1e-6
 tail of a distribution so far out."""
 LATE: Ending = ("deadline", str(Executed.YES))
 """Why a run ends that takes longer than its deadline."""
+AT_DEADLINE = RunEnd(Status.ERROR, True)
 
 
 def cut(
@@ -101,6 +115,17 @@ def cut(
             mean = first / whole
             found[status] = Estimate(whole, mean, sqrt(max(second / whole - mean**2, 0.0)) / mean)
     return found, late
+
+
+def _apart(pooled: Estimate, late: Estimate) -> Estimate | None:
+    """Return what is left of ends with ERROR without those at the deadline, so that both together
+    keep mean and variance; None if that is impossible, as measured times hardly ever are."""
+    share = pooled.share - late.share
+    second = pooled.share * pooled.mean**2 * (1 + pooled.cv**2) - late.share * late.mean**2
+    mean = (pooled.share * pooled.mean - late.share * late.mean) / share
+    if not 0 < mean < late.mean:
+        return None
+    return Estimate(share, mean, sqrt(max(second / share - mean**2, 0.0)) / mean)
 
 
 def _up_to(estimate: Estimate, deadline: float) -> tuple[float, float, float, float]:
@@ -144,6 +169,9 @@ class Numbers:
     measured: Measured
     assumptions: list[str] = field(default_factory=list)
     """What was assumed in the answers so far."""
+    apart: bool = True
+    """Whether runs that end at their deadline have its fixed time. Few phases cannot say that: then
+    one distribution has the mean and variance of all ends with ERROR."""
 
     def alternatives(self, place: Place) -> dict[str, float]:
         """Return the probability of each alternative of a place."""
@@ -164,16 +192,39 @@ class Numbers:
         """Return share, mean (s) and cv by status. Raises NoEstimate."""
         return self._estimates(place, action)[0]
 
+    def ends(self, place: Place, action: str) -> dict[RunEnd, Estimate]:
+        """Return share, mean (s) and cv by how a run ends by itself. Raises NoEstimate."""
+        known, late = self._estimates(place, action)
+        found = {RunEnd(s): e for s, e in known.items() if e.share > 0}
+        if late is None or not late.share:
+            return found
+        error = known[Status.ERROR]
+        if error.share - late.share < NEVER * error.share:
+            found[AT_DEADLINE] = found.pop(RunEnd(Status.ERROR))
+        elif self.apart and (own := _apart(error, late)) is not None:
+            found |= {RunEnd(Status.ERROR): own, AT_DEADLINE: late}
+        else:
+            self.assumptions.append(
+                f"{place.name}: {100 * late.share / error.share:.0f} % of its ends with ERROR come "
+                "at its deadline; with few phases, one distribution has them and all others"
+            )
+        return found
+
     def _estimates(
         self, place: Place, action: str
-    ) -> tuple[Mapping[Status, Estimate], float | None]:
-        """Return them, and the share of the runs that end at their deadline; None if the estimates
-        were measured, and so contain these runs."""
+    ) -> tuple[Mapping[Status, Estimate], Estimate | None]:
+        """Return them, and which of the runs end at their deadline; None if the estimates were
+        measured, and the part of these runs was not."""
         primitive = self.task.primitive_task_of(place.name)
         for key in ((place.name, action), (primitive.name, action)):
             if key in self.measured.runs:
                 known = self.measured.runs[key]
-                return self._cut(place, known) if key in self.measured.expected else (known, None)
+                if key in self.measured.expected:
+                    return self._cut(place, known)
+                late, error = self.measured.late.get(key), known.get(Status.ERROR)
+                if late is None or error is None:
+                    return known, None
+                return known, replace(late, share=late.share * error.share)
         if not primitive.estimates:
             raise NoEstimate(
                 f"primitive_tasks.{primitive.name}: the duration of {action} is unknown: it was "
@@ -187,18 +238,18 @@ class Numbers:
 
     def _cut(
         self, place: Place, estimates: Mapping[Status, Estimate]
-    ) -> tuple[Mapping[Status, Estimate], float]:
+    ) -> tuple[Mapping[Status, Estimate], Estimate]:
         deadline = self.task.primitive_task_of(place.name).deadline
         deadline = min(deadline, inf if place.timeout is None else place.timeout)
         if any(e.share > 0 and not e.mean > 0 for e in estimates.values()):
-            return estimates, 0.0  # it is told elsewhere which mean is missing
+            return estimates, Estimate(0.0, deadline)  # it is told elsewhere which mean is missing
         found, late = cut(estimates, deadline)
         if late:
             self.assumptions.append(
                 f"{place.name}: {late:.3g} of its runs end in ERROR after {deadline:g} s (cause "
                 "`deadline`), by gamma distributions of the declared durations"
             )
-        return found, late
+        return found, Estimate(late, deadline, 0.0)
 
     def causes(self, place: Place, action: str) -> Mapping[Status, Mapping[Ending, float]]:
         """Return how often its runs ended by each cause, by status; empty if not measured."""
@@ -223,11 +274,11 @@ class Numbers:
         self,
         place: Place,
         action: str,
-        status: Status,
+        end: RunEnd,
         examples: Sequence[Ending],
         region: Callable[[Ending], K],
     ) -> dict[K, float]:
-        """Return how probable each kind of end is among the runs that end with a status.
+        """Return how probable each kind of end is among the runs that end in a way of `ends`.
 
         `region` gives the kind: conditions do not tell ends of one kind apart. `examples` has one
         end of each kind. Where no cause was measured, a run is taken to have been executed, and not
@@ -236,7 +287,12 @@ class Numbers:
         kinds = list(dict.fromkeys(map(region, examples)))
         if len(kinds) == 1:
             return {kinds[0]: 1.0}
-        known = {e: n for e, n in self.causes(place, action).get(status, {}).items() if n > 0}
+        apart = AT_DEADLINE in self.ends(place, action)
+        known = {
+            e: n
+            for e, n in self.causes(place, action).get(end.status, {}).items()
+            if n > 0 and (not apart or (e[0] == LATE[0]) == end.late)
+        }
         if known and {region(e) for e in known} <= set(kinds):
             if self._key(place, action) in self.measured.mixed:
                 self._mixed(place.name, {e: region(e) for e in known})
@@ -244,18 +300,20 @@ class Numbers:
             for ending, n in known.items():
                 found[region(ending)] = found.get(region(ending), 0.0) + n / total
             return found
+        if end.late and region(LATE) in kinds:
+            return {region(LATE): 1.0}
         estimates, late = self._estimates(place, action)
         from_outside = (EMERGENCY,) if late is None else (EMERGENCY, LATE[0])
         own = {region((c, str(Executed.YES))) for c, _ in examples if c not in from_outside}
         equal = [kind for kind in kinds if kind in own] or kinds
-        text = f"{place.name}: why its runs end in {status.name} was not measured"
+        text = f"{place.name}: why its runs end in {end.status.name} was not measured"
         if len(equal) < len(kinds):
             text += "; they were executed, and not ended by an emergency stop"
         text += "; causes that lead to different firings are equally likely" * (len(equal) > 1)
         self.assumptions.append(text)
         found = dict.fromkeys(equal, 1.0 / len(equal))
-        if status is Status.ERROR and late and region(LATE) in kinds:
-            share = late / estimates[status].share
+        if end == RunEnd(Status.ERROR) and late and not apart and region(LATE) in kinds:
+            share = late.share / estimates[Status.ERROR].share
             found = {kind: n * (1 - share) for kind, n in found.items()}
             found[region(LATE)] = found.get(region(LATE), 0.0) + share
         return found

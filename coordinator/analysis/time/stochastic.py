@@ -44,6 +44,7 @@ from petrobot.coordinator.analysis.time.measured import (
     Measured,
     NoEstimate,
     Numbers,
+    RunEnd,
     is_cause,
 )
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
@@ -89,6 +90,9 @@ it gives them, where the engine may drop a timer or a latched event in between."
 STAGES = 8
 """Default limit of the phases of one duration. Phases of parallel runs multiply the number of
 markings, so it is small."""
+MANY = 32
+"""Phases from which on a deadline has a distribution of its own. With 8, both fit equally well but
+the variance would be too large."""
 
 Weights = dict[str, int]
 
@@ -127,6 +131,11 @@ _Shared = dict[
 ]
 """Where a run enters the phases of a duration, with probabilities: by status, duration, device, and
 how probable each kind of end is."""
+
+
+def timer_key(transition: str) -> str:
+    """Return the name of a timer in `StochasticView.fit_errors`."""
+    return f"{transition}.after"
 
 
 def _cut(counts: Counts | None) -> str:
@@ -214,6 +223,9 @@ class StochasticView:
     fit_errors: Mapping[str, float]
     """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or by
     timer."""
+    begins: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
+    """By immediate transition that begins a duration of a run: its name in `fit_errors`, place and
+    action."""
     sources: Mapping[str, str] = field(default_factory=dict)
     """By transition of the GSPN: where its rate or weight comes from, in words. Transitions whose
     weight is 1 because the net gives them no choice are not in it."""
@@ -312,9 +324,10 @@ class _Derivation:
         self.origin: dict[str, str] = {}
         self.spoils: set[str] = set()
         self.statuses: dict[str, tuple[str, str, Status]] = {}
-        self.numbers = Numbers(task, measured)
+        self.numbers = Numbers(task, measured, apart=stages >= MANY)
         self.assumptions = self.numbers.assumptions
         self.errors: dict[str, float] = {}
+        self.begins: dict[str, tuple[str, str, str]] = {}
         self.possible: dict[str, set[Status]] = {}
         self.sources: dict[str, str] = {}
         self.comes: dict[str, str] = {}
@@ -402,6 +415,7 @@ class _Derivation:
             self.statuses,
             assumed,
             self.errors,
+            self.begins,
             self.sources,
             frozenset(self.spoils),
             tuple(self.doubts),
@@ -447,9 +461,9 @@ class _Derivation:
         shared: _Shared = {}
         alternatives = self.numbers.alternatives(place)
         endings = {
-            (action, status): ends
+            key: ends
             for status in Status
-            for action, ends in self._endings(place, alternatives, status).items()
+            for key, ends in self._endings(place, alternatives, status).items()
         }
         if alternatives and all(
             (name, action) in self.measured.preempted for action in alternatives
@@ -458,10 +472,9 @@ class _Derivation:
         self._awaited(place)
         for action, chosen in alternatives.items():
             self._choice(place, action, chosen)
-            known = {s: e for s, e in self.numbers.estimates(place, action).items() if e.share > 0}
-            for status, estimate in known.items():
-                ends = endings[action, status]
-                self._status(place, action, status, estimate, ends, shared)
+            known = self.numbers.ends(place, action)
+            for end, estimate in known.items():
+                self._status(place, action, end, estimate, endings[action, end], shared)
             begun, device = f"{name}.{action}", self._device(action)
             if not known:  # no run ever ended by itself: it stays active until it is preempted
                 self.phases[name].append(begun)
@@ -549,8 +562,8 @@ class _Derivation:
 
     def _endings(
         self, place: Place, actions: Iterable[str], status: Status
-    ) -> dict[str, dict[EndKind, float]]:
-        """Return how probable each kind of end with a status is, by action."""
+    ) -> dict[tuple[str, RunEnd], dict[EndKind, float]]:
+        """Return how probable each kind of end with a status is, by action and end."""
         asked, reason = self._asked(place, status), f"{place.name}.reason"
         literals = self._literals(reason)
         if literals is None:  # a cause may be any text, so no finite number of kinds is enough
@@ -565,14 +578,16 @@ class _Derivation:
             both = zip(FIELDS, told, strict=True)
             return tuple(value for field, value in both if f"{place.name}.{field}" in asked)
 
-        found: dict[str, dict[EndKind, float]] = {}
+        found: dict[tuple[str, RunEnd], dict[EndKind, float]] = {}
+        examples = list(product(reasons, executed))
         for action in actions:
-            estimate = self.numbers.estimates(place, action).get(status)
-            if asked and estimate is not None and estimate.share > 0:
-                examples = list(product(reasons, executed))
-                found[action] = self.numbers.endings(place, action, status, examples, kind)
-            else:
-                found[action] = {kind((other, str(Executed.YES))): 1.0}
+            ends = [end for end in self.numbers.ends(place, action) if end.status is status]
+            for end in ends or [RunEnd(status)]:
+                found[action, end] = (
+                    self.numbers.endings(place, action, end, examples, kind)
+                    if asked and ends
+                    else {kind((other, str(Executed.YES))): 1.0}
+                )
         self.kinds[place.name, status] = list(dict.fromkeys(k for e in found.values() for k in e))
         return found
 
@@ -666,6 +681,7 @@ class _Derivation:
             self.places |= dict.fromkeys(chain, 0)
             self.chains |= dict.fromkeys(chain, stem)
             self.phases[name] += chain
+            self.begins[f"{key} {i + 1}"] = (key, name, action)
             self._immediate(
                 f"{key} {i + 1}",
                 {f"{name}.{action}": 1},
@@ -703,16 +719,16 @@ class _Derivation:
         self,
         place: Place,
         action: str,
-        status: Status,
+        end: RunEnd,
         estimate: Estimate,
         ends: Mapping[EndKind, float],
         shared: _Shared,
     ) -> None:
-        """Add the choice of a status, and the phases of its delay.
+        """Add the choice of how a run ends, and the phases of its delay.
 
         Actions with equal distributions share their phases, which keeps the chain small.
         """
-        name, key = place.name, f"{place.name}.{action}.{status}"
+        name, status, key = place.name, end.status, f"{place.name}.{action}.{end}"
         self.possible[name].add(status)
         duration = self._duration(
             key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
@@ -724,7 +740,7 @@ class _Derivation:
         entries = shared[same]
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
-            self.statuses[label] = (name, action, status)
+            self.statuses[label], self.begins[label] = (name, action, status), (key, name, action)
             self._immediate(
                 label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE, source
             )
@@ -1158,7 +1174,7 @@ class _Derivation:
         it: an inhibitor place or a full one. A condition is judged when the time is over.
         """
         assert t.after is not None
-        duration = self._duration(f"{t.name}.after", t.after, 0.0, self.timer_stages)
+        duration = self._duration(timer_key(t.name), t.after, 0.0, self.timer_stages)
         (branch,) = duration.branches
         need = case.need
         stem = self.timers.setdefault((t.name, frozenset(need.items())), name)

@@ -38,7 +38,7 @@ from petrobot.coordinator.analysis.time.completion import (
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import visits_before
-from petrobot.coordinator.analysis.time.stochastic import StochasticView
+from petrobot.coordinator.analysis.time.stochastic import StochasticView, timer_key
 from petrobot.coordinator.task import Kind, Status
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import few
@@ -52,6 +52,26 @@ GOALS = "goals per run"
 one token can meet several goals."""
 TIME = "mean time (s)"
 """Name of the mean time to completion among the figures."""
+
+
+def rough_fits(
+    errors: Mapping[str, float], shares: Mapping[str, float]
+) -> list[tuple[str, float, float]]:
+    """Return (duration, error of its 90 % quantile, share of the time) where the error matters:
+    error times share is at least MATTERS. The most important one comes first."""
+    found = [(key, error, shares.get(key, 0.0)) for key, error in errors.items()]
+    matter = [one for one in found if abs(one[1]) * one[2] >= MATTERS]
+    return sorted(matter, key=lambda one: -abs(one[1]) * one[2])
+
+
+def timer_shares(view: StochasticView, throughput: Mapping[str, float]) -> dict[str, float]:
+    """Return the share of the time of each timer, by its name in `fit_errors`, from the firings of
+    the task's transitions per second."""
+    return {
+        timer_key(name): throughput.get(name, 0.0) * t.after
+        for name, t in view.task.transitions.items()
+        if t.after is not None
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,24 +240,16 @@ class Forecast:
         An error of the 90 % quantile matters as far as its duration has a share in the time of a
         mission run; less than MATTERS of it is left out.
         """
-        shares = {f"{w.place}.{w.action}": w.time_share for w in self.worth}
-        gspn = self.view.gspn
-        for label, (place, action, status) in self.view.statuses.items():
-            key = f"{place}.{action}.{status}"
+        of_action = {(w.place, w.action): w.time_share for w in self.worth}
+        gspn, shares = self.view.gspn, dict[str, float]()
+        for label, (key, place, action) in self.view.begins.items():
             chosen = gspn.weight[gspn.net.transition_index[label]]
-            shares[key] = shares.get(key, 0.0) + chosen * shares.get(f"{place}.{action}", 0.0)
-        after = {n: t.after for n, t in self.view.task.transitions.items() if t.after is not None}
-        for name, seconds in after.items():
-            shares[name] = self._per_second(self.firings.get(name, 0.0) * seconds)
-        found = []
-        for key, error in self.view.fit_errors.items():
-            share = shares.get(key, shares.get(key.rpartition(".")[0], 0.0))
-            if abs(error) * share >= MATTERS:
-                found.append((abs(error) * share, key, error, share))
+            shares[key] = shares.get(key, 0.0) + chosen * of_action.get((place, action), 0.0)
+        shares |= timer_shares(self.view, self.throughput)
         return [
             f"{key}: its 90 % quantile is {100 * error:+.0f} % off, because a duration has few "
             f"phases; it has {100 * share:.0f} % of the time"
-            for _, key, error, share in sorted(found, reverse=True)
+            for key, error, share in rough_fits(self.view.fit_errors, shares)
         ]
 
     @cached_property

@@ -75,7 +75,7 @@ def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tu
     Raises NetFileError.
     """
     runs: Runs = dict(measured.runs)
-    sources = dict(measured.sources)
+    sources, late = dict(measured.sources), dict(measured.late)
     said: dict[tuple[str, str], list[str]] = {}
     shares: dict[tuple[str, str], dict[Status, Change]] = {}
     for change in changes:
@@ -86,11 +86,13 @@ def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tu
             said.setdefault(key, []).append(change.text)
             if change.subject[-1] == "share":
                 shares.setdefault(key, {})[Status(change.subject[-2])] = change
+            elif change.subject[-2] == Status.ERROR:  # it is of all these ends
+                late.pop(key, None)
     for key, wanted in shares.items():
         runs[key] = _with_shares(runs[key], wanted)
     sources |= {key: f"what if {', '.join(texts)}" for key, texts in said.items()}
     expected = measured.expected | (set(sources) - set(measured.runs))
-    return task, replace(measured, runs=runs, sources=sources, expected=expected)
+    return task, replace(measured, runs=runs, sources=sources, expected=expected, late=late)
 
 
 def _other_tokens(task: Task, change: Change) -> Task:

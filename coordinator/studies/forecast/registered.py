@@ -218,13 +218,18 @@ def _share_error(
     if p <= 0.0:
         return None
     slopes = reliability_slopes(found.done)
+    shares: dict[tuple[str, str, Status], float] = {}
+    for label, end in found.view.statuses.items():
+        shares[end] = shares.get(end, 0.0) + slopes[label].value
     moves: dict[tuple[str, str], dict[Status, list[float]]] = {}
-    for label, (place, action, status) in found.view.statuses.items():
+    for label, end in found.view.statuses.items():
+        place, action, status = end
         primitive = task.primitive_task_of(place).name
-        # places with the same primitive task share its runs
+        # Places with the same primitive task share its runs; the branches of a duration share the
+        # runs of its status.
         own = moves.setdefault((primitive, action), {}).setdefault(status, [0.0, 0.0])
-        own[0] += slopes[label].derivative
-        own[1] = slopes[label].value
+        own[0] += slopes[label].derivative * slopes[label].value / shares[end]
+        own[1] = shares[end]
     for (primitive, action), by_status in moves.items():
         tallies = estimates.of(primitive, context).get(action, {})
         runs = sum(t.runs for t in tallies.values())
