@@ -94,6 +94,9 @@ class Setup:
     """Limit of the address space (bytes), 0 for none."""
     tickets: Mapping[str, str] = field(default_factory=dict)
     """The ticket of each stream that this node receives."""
+    keys: Sequence[bytes] = ()
+    """The shared keys as the node read them at its start. A process that read the file again might
+    find another key, or none, and reach no other process."""
     log_level: int = logging.INFO
     """Lowest level that is logged."""
 
@@ -322,7 +325,9 @@ class Worker:
         """Whether a run used up the memory, so that the next one needs a new process."""
         self._changed = False
         """Whether a run has changed this process for good."""
-        self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
+        self._outlets = StreamOutlets(
+            directory, f"{setup.node} {setup.device or 'actions'}", setup.keys
+        )
         self._connecting = False
         # Faster than a selector. It also reports an end that user code has closed, which epoll
         # would forget.
@@ -508,7 +513,7 @@ def serve(
         directory = parse(setup.text, Path(setup.source))
         if link is None and setup.device:
             ports = ProcessPorts(
-                directory, directory.devices[setup.device], monotonic, setup.tickets
+                directory, directory.devices[setup.device], monotonic, setup.tickets, setup.keys
             )
             driver = make_driver(directory, directory.devices[setup.device], ports)
             ports.draws.reseed(0)
