@@ -312,6 +312,9 @@ def test_a_file_that_is_not_text(tmp_path: Path, data: bytes) -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(TaskFileError, match="cannot be read"):
         load(tmp_path / "none.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(TaskFileError, match=r"Is a directory.*its permissions$"):
+        load(tmp_path / "folder.toml")
 
 
 @pytest.mark.parametrize(
