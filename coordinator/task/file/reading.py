@@ -206,7 +206,7 @@ class Table:
             self.fault(
                 name,
                 f"{text!r} is none of {', '.join(words)}",
-                nearest(text, list(words)).strip(" ()"),
+                nearest(text, list(words)).strip(" ()") or "write one of these",
             )
             return first
 
