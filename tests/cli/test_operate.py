@@ -235,6 +235,7 @@ async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot
     ):
         answer = await operation.command(who, verb, data)
         assert (answer["ok"], answer["code"]) == (False, "bad_data"), (verb, answer)
+        assert "; give " in answer["text"]
     assert (await operation.command(who, "remark", {"text": "still works"}))["ok"]
     assert (await operation.command(who, "pause", {}))["ok"]
 
