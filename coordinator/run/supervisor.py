@@ -171,7 +171,7 @@ class Supervisor:
         why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
         code = child.process.returncode if child.process is not None else None
         if code is not None and code < 0:
-            why = f"was ended by {signal.Signals(-code).name}"
+            why = f"was ended by a signal ({signal.strsignal(-code)})"
         told = f"ends with:\n{tail}" if tail else "says nothing; start it again"
         raise LaunchError(f"node {child.program.name} {why}; its log {child.log} {told}")
 
