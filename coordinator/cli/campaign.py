@@ -220,7 +220,7 @@ def run(options: argparse.Namespace) -> int:
         check = None if options.check is None else _checked(options.check, folder)
     except CampaignError as fault:
         raise CommandError(2, str(fault)) from fault
-    write_json(str(folder / "result.json"), result)
+    write_json(str(folder / "result.json"), result, "--out a folder")
     if options.json:
         write_json(options.json, result if check is None else {**result, "check": check})
     if options.json != "-":

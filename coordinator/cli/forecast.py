@@ -19,7 +19,7 @@ from petrobot.coordinator.cli.loading import (
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
 from petrobot.services.comm.location_file import FIRST_PHYSICS, physics_of, same_physics
-from petrobot.services.host.command_line import whole
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_services_argument(parser)
     parser.add_argument(
         "--runs",
-        type=whole(),
+        type=whole(most=MOST_RUNS),
         default=1000,
         metavar="N",
         help="number of further runs in each regime (%(default)s)",
@@ -87,7 +87,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="number of bootstrap samples (%(default)s)",
     )
     parser.add_argument(
-        "--seed", type=whole(0), default=1, metavar="S", help="seed of the simulation (%(default)s)"
+        "--seed",
+        type=whole(0, LARGEST_SEED),
+        default=1,
+        metavar="S",
+        help="seed of the simulation (%(default)s)",
     )
     parser.add_argument(
         "--out",

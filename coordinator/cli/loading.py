@@ -381,8 +381,8 @@ def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
     return dict(draw(result))
 
 
-def write_json(path: str, data: Any) -> None:
-    """Write results as JSON; `-` is standard output."""
+def write_json(path: str, data: Any, give: str = "--json a file") -> None:
+    """Write results as JSON; `-` is standard output. `give` names the option that says where."""
     text = json_text(data, indent=2, ensure_ascii=False) + "\n"
     if path == "-":
         print(text, end="")
@@ -392,5 +392,5 @@ def write_json(path: str, data: Any) -> None:
         write_whole(Path(path), text)
     except OSError as fault:
         raise CommandError(
-            2, f"{path}: {fault.strerror or fault}; give --json a file that can be written"
+            2, f"{path}: {fault.strerror or fault}; give {give} that can be written"
         ) from fault

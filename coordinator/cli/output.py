@@ -194,7 +194,7 @@ def give(session: RunSession, options: argparse.Namespace, timeline: Timeline | 
         from petrobot.coordinator.studies.report import report_html
 
         task = session.mission.executor.task
-        write_json(str(options.report / "result.json"), result)
+        write_json(str(options.report / "result.json"), result, "--report a folder")
         page = options.report / "index.html"
         net = draw(task, error_branches=True)
         write_whole(page, report_html(result, timeline, net, pictures_of(task, result)))

@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,9 +57,11 @@ def run(options: argparse.Namespace) -> int:
             write_json(options.json, result)
         return 0 if result["status"] == "success" else 1
 
+    directory, changed = located(found.directory)
+    found = replace(found, directory=directory)
     if mode == "realtime":
-        refuse_stopped(found.directory)
-        if changed := changed_file(found.directory):
+        refuse_stopped(directory)
+        if changed:
             print(changed, file=sys.stderr)
         if later := later_run(found.journal):
             print(
@@ -75,18 +78,22 @@ def run(options: argparse.Namespace) -> int:
     return conduct(make, options, mode)
 
 
-def changed_file(recorded: Directory) -> str:
-    """Return a warning if the location file is not the one with which the run began."""
+def located(recorded: Directory) -> tuple[Directory, str]:
+    """Return the location file with which a run continues, and a warning if it has changed since
+    the run began: then it is that of the beginning. A change of `[keys]` is none, and counts:
+    otherwise no run could continue after its nodes had another key."""
     from petrobot.services.comm.location_file import DirectoryError, load
 
     with contextlib.suppress(DirectoryError, OSError):
-        if load(recorded.source).hash != recorded.hash:
-            return (
-                f"{recorded.source} has changed since this run began, and a run continues with the "
-                "file of its beginning: if a node refuses it or does not answer, put that one "
-                "back and start the nodes again"
-            )
-    return ""
+        present = load(recorded.source, recorded.dry_run)
+        if present.hash == recorded.hash:
+            return present, ""
+        return recorded, (
+            f"{recorded.source} has changed since this run began, and a run continues with the "
+            "file of its beginning: if a node refuses it or does not answer, put that one "
+            "back and start the nodes again"
+        )
+    return recorded, ""
 
 
 def later_run(journal: Journal) -> str:

@@ -338,7 +338,10 @@ def conduct(
     except (CellError, UnreachableError, LaunchError) as fault:
         raise CommandError(3, str(fault)) from fault
     except JournalError as fault:
-        raise CommandError(1 if made else 2, str(fault)) from fault
+        if not made:
+            raise CommandError(2, str(fault)) from fault
+        again = f"correct that, then `petrobot resume {made[0].folder}` continues this run"
+        raise CommandError(1, f"{fault}; {again}") from fault
     except (RequestError, DepartureError, EstimatesError, ReplayError, DirectoryError) as fault:
         raise CommandError(2, str(fault)) from fault
     [session] = made

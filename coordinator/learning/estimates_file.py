@@ -65,6 +65,13 @@ from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
 """Seconds that a command waits while another one writes the file."""
+UNWRITABLE = {
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_READONLY,
+}
+"""SQLite's primary result codes for a file that is not damaged."""
 PHYSICS = "physics"
 """Row of the table `about`."""
 MOCK, SIMULATED, REAL = "mock", "simulated", "real"
@@ -459,9 +466,10 @@ class EstimatesFile:
                 db.execute("PRAGMA synchronous = FULL")
                 yield db
         except sqlite3.Error as fault:
-            raise EstimatesError(
-                f"{self.path}: {fault}; restore it from a copy, or give --learn another file"
-            ) from fault
+            remedy = "restore it from a copy, or give --learn another file"
+            if getattr(fault, "sqlite_errorcode", 0) & 0xFF in UNWRITABLE:
+                remedy = "give --learn a file that can be written, in a folder that can be"
+            raise EstimatesError(f"{self.path}: {fault}; {remedy}") from fault
         except (ValueError, KeyError, TypeError) as fault:
             raise EstimatesError(
                 f"{self.path}: its contents do not fit ({fault}); restore it from a copy, or "

@@ -285,7 +285,8 @@ class Operation:
         try:
             digest([stimulus])
         except (OverflowError, UnicodeEncodeError) as fault:
-            return refusal("bad_data", f"no journal can store this: {fault}")
+            remedy = "a smaller number" if isinstance(fault, OverflowError) else "Unicode text"
+            return refusal("bad_data", f"no journal can store this: {fault}; give {remedy}")
         self._refusals.clear()
         try:
             self.executor.stimulate(self.shell.now(), stimulus)

@@ -169,9 +169,11 @@ class Supervisor:
         said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
         tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
         why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
-        raise LaunchError(
-            f"node {child.program.name} {why}; its log {child.log} ends with:\n{tail}"
-        )
+        code = child.process.returncode if child.process is not None else None
+        if code is not None and code < 0:
+            why = f"was ended by a signal ({signal.strsignal(-code)})"
+        told = f"ends with:\n{tail}" if tail else "says nothing; start it again"
+        raise LaunchError(f"node {child.program.name} {why}; its log {child.log} {told}")
 
     async def _keep(self, child: _Child) -> None:
         loop, pause = asyncio.get_running_loop(), FIRST_PAUSE

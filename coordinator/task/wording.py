@@ -8,6 +8,8 @@ from difflib import get_close_matches
 from enum import StrEnum
 from textwrap import wrap
 
+from petrobot.services.host.toml_text import shortened
+
 COLUMNS = 100
 """The widest text in a terminal."""
 
@@ -27,6 +29,9 @@ class Fault:
     key: str
     text: str
     remedy: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "text", shortened(self.text))
 
     def __str__(self) -> str:
         return f"{self.key}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")

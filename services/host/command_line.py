@@ -49,6 +49,9 @@ def log_to_stderr(level: int = logging.INFO) -> None:
     logging.getLogger("numba").setLevel(max(level, logging.INFO))
 
 
+LARGEST = 10**9
+"""Largest whole number of an option that does not say otherwise: numpy, the kernel and `islice`
+refuse those of more than 64 bits."""
 MOST_RUNS = 1_000_000
 """Largest number of runs that one command may ask for."""
 LARGEST_SEED = 2**63 - 1
@@ -61,7 +64,7 @@ def _refusal(text: str) -> ArgumentTypeError:
     return ArgumentTypeError(text)
 
 
-def whole(least: int = 1, most: int | None = None) -> Callable[[str], int]:
+def whole(least: int = 1, most: int = LARGEST) -> Callable[[str], int]:
     """Return the type of an option that takes a whole number of at least `least`, at most
     `most`."""
 
@@ -72,7 +75,7 @@ def whole(least: int = 1, most: int | None = None) -> Callable[[str], int]:
             value = least - 1
         if value < least:
             raise _refusal(f"{text} is not a whole number of at least {least}")
-        if most is not None and value > most:
+        if value > most:
             raise _refusal(f"{text} is more than the largest number, {most}")
         return value
 

@@ -13,6 +13,10 @@ _KEY = re.compile(r"""\s*([\w./\-"']+)\s*=""")
 
 NOT_TOML = "not valid TOML"
 """Stands for the key of a fault that concerns the text as a whole."""
+_TOO_LARGE = "needs more than 64 bits", "write a smaller number"
+_ENDLESS = re.compile(r"\d{4301}")
+LONGEST = 1_000
+"""Most characters of a fault that are shown: the value in it may be a whole file."""
 
 
 class TomlError(ValueError):
@@ -38,14 +42,24 @@ def read_toml(text: str | bytes, source: str) -> dict[str, Any]:
     text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     try:
         data = tomllib.loads(text)
-        if key := _too_large(data, ""):
-            line = line_of(key, key_lines(text))
-            raise TomlError(source, line, key, "needs more than 64 bits", "write a smaller number")
-        return data
     except tomllib.TOMLDecodeError as error:
         raise TomlError(source, *_syntax_fault(text, str(error))) from error
     except RecursionError as error:
         raise TomlError(source, None, NOT_TOML, "nested too deeply", "flatten it") from error
+    except ValueError as error:  # Python reads no number of more than 4,300 digits
+        lines = enumerate(text.splitlines(), 1)
+        line = next((at for at, line in lines if _ENDLESS.search(line.replace("_", ""))), None)
+        raise TomlError(source, line, "a number", *_TOO_LARGE) from error
+    if key := _too_large(data, ""):
+        raise TomlError(source, line_of(key, key_lines(text)), key, *_TOO_LARGE)
+    return data
+
+
+def shortened(fault: str) -> str:
+    """Return the text of a fault without the middle of one that nobody would read."""
+    if len(fault) <= LONGEST:
+        return fault
+    return f"{fault[: LONGEST // 2]} ... {fault[-LONGEST // 2 :]}"
 
 
 def not_utf8(error: UnicodeDecodeError, source: str) -> TomlError:

@@ -127,6 +127,8 @@ class Child:
         self._ended = ended
         self._loop = asyncio.get_running_loop()
         self._logs = _log.isEnabledFor(logging.DEBUG)
+        self.last_word = b""
+        """What its process said as it ended: LINK_LOST, NO_MEMORY, or empty."""
         self.pipe, pipe_end = pipe_pair()
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         counter = permit_counter()
@@ -317,6 +319,8 @@ class Child:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LEAVE_LIMIT):
                     await until_ended(self._worker)
+        with contextlib.suppress(OSError):  # it said nothing
+            self.last_word = self._descriptors.recv(1, socket.MSG_DONTWAIT)
         self._descriptors.close()
         self._ended(self)
         self._permits.close()

@@ -3,7 +3,7 @@ streams."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import CanBus
@@ -104,9 +104,11 @@ class ProcessPorts(DevicePorts):
         device: DeviceEntry,
         clock: Callable[[], float],
         tickets: Mapping[str, str],
+        keys: Sequence[bytes] = (),
     ) -> None:
         super().__init__(directory, device, clock)
         self._tickets = tickets
+        self._key = tuple(keys) or None
         self._can: CanBus | None = None
         self._images: ImageSource | None = None
         self._setpoints: dict[str, SetpointReceiver] = {}
@@ -159,7 +161,7 @@ class ProcessPorts(DevicePorts):
     def _listen(self, ticket: str) -> None:
         if self._receiver is None:
             host = self._directory.nodes[self._device.node].host
-            key = credentials(self._directory, self._device.node).stream_key(ticket)
+            key = credentials(self._directory, self._device.node, self._key).stream_key(ticket)
             self._receiver = StreamReceiver(
                 self._device.name, self._incoming, host=host, key=key, clock=self._clock
             )

@@ -21,7 +21,7 @@ from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
 from petrobot.services.comm.protocol.messages import Call
-from petrobot.services.comm.protocol.security import require_key
+from petrobot.services.comm.protocol.security import all_keys, require_key
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
@@ -58,11 +58,12 @@ class NodeShell:
         self._loop = asyncio.get_running_loop()
         self._now = clock_of(self._loop)
         self._tickets = _tickets(directory, name)
+        self._credentials = credentials(directory, name)
+        keys = all_keys(self._credentials.key)
         level = logging.getLogger().getEffectiveLevel()
         self._setup = Setup(
-            str(directory.source), text, name, "", mock, memory, self._tickets, level
+            str(directory.source), text, name, "", mock, memory, self._tickets, keys, level
         )
-        self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Host] = {**self._workers}
         self.latch = latch_of(directory.source, name)
@@ -80,6 +81,8 @@ class NodeShell:
         self.server = Server(self.node.callee, on_orders=self._obey, key=key, tls=tls)
         self._client_tls = self._credentials.client()
         self._clients: dict[str, Client] = {}
+        self._unfound: dict[str, str] = {}
+        """Why the receiver of a stream could not be asked for its address, as last logged."""
         self._tasks: set[asyncio.Task[None]] = set()
         self._alarm = Alarm(self._step)
         self._beating: asyncio.TimerHandle | None = None
@@ -243,7 +246,17 @@ class NodeShell:
         outcome = await self._clients[peer].call(stream_service(stream), deadline=1.0)
         if outcome.status == Status.SUCCESS:
             at = outcome.values
+            self._unfound.pop(stream, None)
             self._workers[device].stream_at(stream, at["host"], at["port"], at["ticket"])
+        elif outcome.text != self._unfound.get(stream):
+            self._unfound[stream] = outcome.text
+            _log.warning(
+                "stream %s: %s does not tell where it goes: %s %s",
+                stream,
+                peer,
+                outcome.cause,
+                outcome.text,
+            )
 
 
 def _tickets(directory: Directory, node: str) -> dict[str, str]:

@@ -469,14 +469,14 @@ class WorkerHost:
         if child is not None and child is self._retiring:
             self._retiring = None
         elif (
-            child is None or child.code != LINK_LOST
+            child is None or child.last_word != LINK_LOST
         ):  # a process that lost its driver does not count: the driver died
             self._deaths = 0 if now - self._started > STABLE else self._deaths + 1
             if child is not None:
                 self.restarts += 1
                 self.last_death = self.failed or self._died
         pause = PAUSES[min(self._deaths, len(PAUSES)) - 1] if self._deaths else 0.0
-        if child is not None and child.code == LINK_LOST:
+        if child is not None and child.last_word == LINK_LOST:
             pause = max(pause, DRIVER_GONE)
         self._restart_at = now + pause
         why = self.failed or self._died
@@ -854,9 +854,9 @@ class WorkerHost:
 
 def _cause_of(child: Child) -> tuple[str, str]:
     """Return cause and text for the runs of a process that ended by itself."""
-    if child.code == LINK_LOST:
+    if child.last_word == LINK_LOST:
         return "device_died", DRIVER_DIED
-    if child.code == NO_MEMORY:
+    if child.last_word == NO_MEMORY:
         return (
             OUT_OF_MEMORY,
             "the memory of its process was used up; see worker_memory_mb in services.toml",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import _locale
 import builtins
+import contextlib
 import logging
 import os
 import resource
@@ -70,9 +71,12 @@ SETUP, BORN, READY, FAILED = "setup", "born", "ready", "failed"
 WANTED, STREAM_AT, DROPPED = "wanted", "stream_at", "dropped"
 OUT_OF_MEMORY = "out_of_memory"
 """Cause of a run that used up the memory of its process."""
-LINK_LOST, NO_MEMORY, CHANGED = 90, 91, 92
-"""Exit codes: the driver's process has ended; not even the report of a run fits into the remaining
-memory; a run has changed its process for good."""
+LINK_LOST, NO_MEMORY = b"l", b"m"
+"""Last words of a process: the driver's process has ended; not even the report of a run fits into
+the remaining memory. They are sent over DESCRIPTORS: user code may end its process with any exit
+code, and the pipe may be full of what there is no memory to send."""
+CHANGED = 92
+"""Exit code: a run has changed its process for good."""
 
 
 _log = logging.getLogger(__name__)
@@ -94,6 +98,9 @@ class Setup:
     """Limit of the address space (bytes), 0 for none."""
     tickets: Mapping[str, str] = field(default_factory=dict)
     """The ticket of each stream that this node receives."""
+    keys: Sequence[bytes] = ()
+    """The shared keys as the node read them at its start. A process that read the file again might
+    find another key, or none, and reach no other process."""
     log_level: int = logging.INFO
     """Lowest level that is logged."""
 
@@ -267,6 +274,10 @@ class Surroundings:
             return ""
 
 
+class LinkLostError(Exception):
+    """The driver's process has ended."""
+
+
 class Worker:
     """Runs actions. Orders and reports travel over the node's pipe, device commands and states over
     the link."""
@@ -322,7 +333,9 @@ class Worker:
         """Whether a run used up the memory, so that the next one needs a new process."""
         self._changed = False
         """Whether a run has changed this process for good."""
-        self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
+        self._outlets = StreamOutlets(
+            directory, f"{setup.node} {setup.device or 'actions'}", setup.keys
+        )
         self._connecting = False
         # Faster than a selector. It also reports an end that user code has closed, which epoll
         # would forget.
@@ -332,14 +345,15 @@ class Worker:
             self._ends.register(link, select.POLLIN)
 
     def await_device(self) -> None:
-        """Wait for the first state of the driver at the other end of the link."""
+        """Wait for the first state of the driver at the other end of the link. Raises
+        LinkLostError."""
         while self._remote is not None and self._remote.age == float("inf"):
             self._ends.poll()
             if self._link is not None:
                 self._read_link(self._link)
 
     def run(self) -> None:
-        """Serve until the node has ended. Exits if the driver fails."""
+        """Serve until the node has ended. Exits if the driver fails. Raises LinkLostError."""
         while not self._node.closed:
             pause = self._pause()
             self._ends.poll(None if pause is None else 1e3 * min(pause, LONGEST_PAUSE))
@@ -474,7 +488,7 @@ class Worker:
             self._remote.take(DeviceState(*items))
         if link.closed:
             # Without its driver this process is of no use; the node starts both again.
-            os._exit(LINK_LOST)
+            raise LinkLostError
 
     def _post_command(self, command: DeviceCommand) -> None:
         assert self._link is not None
@@ -508,7 +522,7 @@ def serve(
         directory = parse(setup.text, Path(setup.source))
         if link is None and setup.device:
             ports = ProcessPorts(
-                directory, directory.devices[setup.device], monotonic, setup.tickets
+                directory, directory.devices[setup.device], monotonic, setup.tickets, setup.keys
             )
             driver = make_driver(directory, directory.devices[setup.device], ports)
             ports.draws.reseed(0)
@@ -560,8 +574,10 @@ def main(passed: Sequence[int]) -> None:
     keep_from_copies(descriptors)
     try:
         serve(node, descriptors, link, permits)
-    except MemoryError:
-        os._exit(NO_MEMORY)
+    except (LinkLostError, MemoryError) as fault:
+        with contextlib.suppress(OSError):  # user code has closed it
+            descriptors.send(LINK_LOST if isinstance(fault, LinkLostError) else NO_MEMORY)
+        os._exit(1)
     finally:
         # At its end Python waits for every thread that is not a daemon, and some never end.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -6,6 +6,7 @@ or withdraws it; the receiving end has a watchdog on its age.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from petrobot.services.comm.protocol.codec import LIMITS
 from petrobot.services.comm.protocol.messages import SetPoint
 from petrobot.services.comm.streams.stream import STALE_AFTER, StreamSender
 from petrobot.services.comm.tls.credentials import credentials
+
+_log = logging.getLogger(__name__)
 
 # --- receiving ---
 
@@ -175,12 +178,14 @@ class StreamOutlets:
     """Sending ends by stream, made when first needed. If a receiver does not accept a stream, its
     address is requested again."""
 
-    def __init__(self, directory: Directory, sender: str) -> None:
+    def __init__(self, directory: Directory, sender: str, keys: Sequence[bytes]) -> None:
         self._sender = sender
         self._streams = directory.streams
-        self._credentials = credentials(directory, sender)
+        self._credentials = credentials(directory, sender, tuple(keys) or None)
         self._outlets: dict[str, StreamSender] = {}
         self._asked: dict[str, float] = {}
+        self._refusals: dict[str, str] = {}
+        """The last refusal of each stream that was logged."""
 
     def send(self, now: float, sent: Sent) -> bool:
         """Send a set point. Return True if the stream's address must be requested (again)."""
@@ -194,12 +199,15 @@ class StreamOutlets:
 
     def found(self, stream: str, host: str, port: int, ticket: str) -> None:
         """Connect to a stream's address, unless it is connected there already."""
-        older = self._outlets.get(stream)
+        older, entry = self._outlets.get(stream), self._streams[stream]
         if older is not None and older.up:
             return
         if older is not None:
+            if older.refusal not in ("", self._refusals.get(stream)):
+                self._refusals[stream] = older.refusal
+                _log.warning("stream %s: refused by %s: %s", stream, entry.to, older.refusal)
             older.close()
-        key, entry = self._credentials.stream_key(ticket), self._streams[stream]
+        key = self._credentials.stream_key(ticket)
         outlet = StreamSender(
             self._sender,
             stream,

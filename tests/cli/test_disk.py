@@ -87,6 +87,9 @@ def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_pa
         assert "Traceback" not in outcome["said"], where
         assert outcome["code"] == 2 and len(told) == 1 and said[-1] == told[0], where
         assert name in told[0] and "; " in told[0], where
+        remedy = told[0].partition("; give ")[2].split()
+        assert not remedy or remedy[0] in (*command.split(), "--file", "--out", "--folder"), where
+        assert "copy" not in told[0], where
         assert any(
             word in told[0] for word in ("No space left", "Read-only", "is full", "unable to open")
         ), where

@@ -936,6 +936,10 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
         [*RUN, "--seed", "9" * 30],
         r"--seed: 9+ is more than the largest number, 9223372036854775807",
     ),
+    (
+        ["analyse", "arm_bot.toml", "--memory", "9" * 30],
+        r"--memory: 9+ is more than the largest number, 1000000000",
+    ),
     ([*RUN, "--set", "speed=1"], r"speed"),
     ([*RUN, "--use", "grip=grab"], r"grab.*grip"),
     ([*RUN, "--services", "cell.toml"], r"cell.toml: No such file"),

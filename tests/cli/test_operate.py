@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import COMMANDS, main
-from petrobot.coordinator.cli.resume import changed_file, later_run
+from petrobot.coordinator.cli.resume import later_run, located
 from petrobot.coordinator.engine import Mode
 from petrobot.coordinator.operator.run_address import (
     ADDRESS_FILE,
@@ -93,15 +93,19 @@ def test_a_resume_names_the_run_that_has_used_the_devices_since(
     assert later_run(read_journal(own)) == told
 
 
-def test_a_resume_warns_of_a_changed_location_file(tmp_path: Path) -> None:
+def test_a_resume_uses_new_keys_and_warns_of_another_changed_location_file(tmp_path: Path) -> None:
     file = tmp_path / "services.toml"
     file.write_text('schema = 1\n[nodes]\na = { host = "127.0.0.1", port = 7001 }\n')
     began = load(file)
-    assert changed_file(began) == ""
-    file.write_text(file.read_text() + 'b = { host = "127.0.0.1", port = 7002 }\n')
-    assert str(file) in changed_file(began)
+    text = file.read_text()
+    file.write_text(f'{text}[keys]\nfile = "new.key"\n')
+    assert located(began) == (load(file), "")
+    file.write_text(text + 'b = { host = "127.0.0.1", port = 7002 }\n')
+    directory, warning = located(began)
+    assert directory is began
+    assert str(file) in warning
     file.unlink()
-    assert changed_file(began) == ""
+    assert located(began) == (began, "")
 
 
 async def test_a_device_that_cannot_hold_says_so(petrobot: Terminal) -> None:
@@ -231,6 +235,7 @@ async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot
     ):
         answer = await operation.command(who, verb, data)
         assert (answer["ok"], answer["code"]) == (False, "bad_data"), (verb, answer)
+        assert "; give " in answer["text"]
     assert (await operation.command(who, "remark", {"text": "still works"}))["ok"]
     assert (await operation.command(who, "pause", {}))["ok"]
 

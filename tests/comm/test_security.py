@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hmac
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -85,6 +87,14 @@ def test_a_key_of_another_user_is_refused(tmp_path: Path) -> None:
     os.chown(path, 12345, 12345)
     with pytest.raises(KeyFileError, match="belongs to another user"):
         read_key(path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.open", partial(_deny, path))
+        with pytest.raises(KeyFileError, match=f"{path}: this user .* may not read it; run"):
+            read_key(path)
+
+
+def _deny(path: Path, *_: object) -> int:
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
 
 def test_a_key_file_is_checked_and_read_through_one_descriptor(tmp_path: Path) -> None:

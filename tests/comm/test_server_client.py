@@ -261,3 +261,21 @@ async def test_the_reason_of_a_failed_attempt_stays_while_the_next_one_is_under_
     for writer in attempts:
         writer.close()
     server.close()
+
+
+async def test_a_program_that_is_not_a_node_is_suspected(key: bytes | None) -> None:
+    """For example a web server at the port of a node."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+        await reader.read()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    coordinator = Coordinator(*server.sockets[0].getsockname(), key=key)
+    try:
+        suspects = "is it a node of petrobot?"
+        await waiting.until(lambda: coordinator.client.trouble.endswith(suspects), suspects)
+    finally:
+        await coordinator.client.close()
+        server.close()

@@ -22,6 +22,7 @@ from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read
         ),
         ("[t", ":1: not valid TOML: Expected ']' at the end of a table declaration"),
         (b"a = 1\nb = '\xff'", ":2: file: is not UTF-8; save it as UTF-8"),
+        (f"a = 1\nb = [{'1_0' * 3000}]", ":2: a number: needs more than 64 bits; write a smaller"),
         ("[t]\na = [1, { b = -9223372036854775809 }]", ":2: t.a.b: needs more than 64 bits; write"),
         ("a = " + "[" * 100_000, ": not valid TOML: nested too deeply; flatten it"),
     ],

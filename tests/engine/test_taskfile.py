@@ -309,9 +309,24 @@ def test_a_file_that_is_not_text(tmp_path: Path, data: bytes) -> None:
         load(path)
 
 
+def test_a_fault_of_a_huge_value_is_shortened() -> None:
+    with pytest.raises(TaskFileError) as fault:
+        loads(f'schema = "{"x" * 10**6}"', "huge.toml")
+    assert all(len(line) < 2_000 for line in str(fault.value).splitlines())
+    assert "huge.toml:1: schema: 'xx" in str(fault.value)
+
+
+def test_a_word_that_is_like_no_other_has_a_remedy() -> None:
+    with pytest.raises(TaskFileError, match=r"a.kind: '' is none of .*; write one of these"):
+        loads('schema = 1\n[places]\na = { kind = "" }\n', "odd.toml")
+
+
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(TaskFileError, match="cannot be read"):
         load(tmp_path / "none.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(TaskFileError, match=r"Is a directory.*its permissions$"):
+        load(tmp_path / "folder.toml")
 
 
 @pytest.mark.parametrize(

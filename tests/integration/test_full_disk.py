@@ -54,6 +54,7 @@ def test_a_full_disk_ends_the_run_with_a_clear_error_and_loses_nothing(tmp_path:
         assert f"{JOURNAL}: File too large; nothing was sent on the strength of it" in done.stderr
         assert "Traceback" not in done.stderr
         [run] = runs.iterdir()
+        assert f"`petrobot resume {run}` continues this run" in done.stderr
         kept = [
             r.data["stimulus"] for r in read_journal(run / JOURNAL).records if r.kind == "stimulus"
         ]

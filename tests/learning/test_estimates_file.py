@@ -343,7 +343,7 @@ def asked_of(path: Path, statement: str) -> Path:
     [
         (
             lambda p: p.write_bytes(b"no database at all, but long enough to be looked at" * 9),
-            "not a database",
+            "not a database; restore it",
         ),
         (lambda p: written(p, "CREATE TABLE songs(name)"), "not an estimates file"),
         (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 99"), "got 99.*upgrade"),
@@ -357,7 +357,7 @@ def asked_of(path: Path, statement: str) -> Path:
         ),
         (lambda p: asked_of(p, "UPDATE question SET target = 7"), "target.*got 7.0"),
         (lambda p: asked_of(p, "UPDATE question SET rho = -3"), "rho.*got -3.0"),
-        (lambda p: p.mkdir(), "unable to open"),
+        (lambda p: p.mkdir(), "unable to open.*that can be written"),
     ],
     ids=[
         "text",

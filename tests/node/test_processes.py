@@ -341,12 +341,17 @@ async def test_a_hanging_action_that_moves_has_its_device_stopped_first(operator
 
 
 @pytest.mark.parametrize(
-    ("service", "says"), [("segfault", "SIGSEGV"), ("leave", "exited with code 7")]
+    ("service", "code", "says"),
+    [
+        ("segfault", {}, "SIGSEGV"),
+        # 90 and 91 once meant something to the node
+        *(("leave", {"code": code}, f"exited with code {code}") for code in (0, 7, 90, 91, 92)),
+    ],
 )
 async def test_a_dying_worker_is_reported_and_started_again(
-    operator: Operator, service: str, says: str
+    operator: Operator, service: str, code: dict[str, int], says: str
 ) -> None:
-    end = await operator.call(service)
+    end = await operator.call(service, **code)
     assert (end.status, end.cause, end.executed) == ("error", "worker_died", "unknown")
     assert says in end.text
     assert (await operator.call("add", a=1)).values == {"sum": 2}

@@ -68,6 +68,7 @@ class FakeChild:
         self._heard = heard
         self._ended = ended
         self.code: int | None = None
+        self.last_word = b""
         self.closed = self.dead = False
         self.begun = 1 << 30
         """How many of its runs it reports as begun; by default all."""
@@ -124,7 +125,8 @@ class FakeChild:
     def describe(self) -> str:
         return "it was ended by SIGTEST"
 
-    def die(self, code: int = -9) -> None:
+    def die(self, code: int = -9, last_word: bytes = b"") -> None:
+        self.last_word = last_word
         self.code, self.closed, self.dead = code, True, True
         self._ended(self)
 
@@ -551,7 +553,7 @@ class Storm:
         elif act == "actions die" and workers:
             workers[-1].die()
         elif act == "link lost" and workers:
-            workers[-1].die(LINK_LOST)
+            workers[-1].die(1, LINK_LOST)
         elif act == "end" and workers:
             had = [o.id for o in workers[-1].orders() if isinstance(o, Call)]
             if newest in had:

@@ -90,6 +90,10 @@ async def test_a_program_that_does_not_start_is_named_with_the_end_of_its_log(
     assert str(again.value).count("no device at can0") == 1, (
         "what an earlier start left in the log is not its end"
     )
+    killed = program("k", "import os; os.kill(os.getpid(), 9)")
+    says = r"node k was ended by a signal \(Killed\); its log .*k\.log says nothing; start it again"
+    with pytest.raises(LaunchError, match=says):
+        await Supervisor([killed], tmp_path).__aenter__()
 
 
 async def test_ctrl_c_does_not_reach_the_nodes_before_the_launcher_stops_them(

@@ -16,6 +16,7 @@ from petrobot.services.comm.protocol.security import new_key, write_key
 from petrobot.services.comm.tls.certificates import make_certificates
 from tests.node.test_processes import CELL, PATIENCE, start_node
 from tests.ports import free_ports
+from tests.processes import below, kill
 from tests.security.test_streams import GuardedOperator
 
 pytestmark = pytest.mark.processes
@@ -98,7 +99,7 @@ class Hosts:
         """Return whether set points arrive from node to node."""
         following = asyncio.create_task(operator.call("follow", seconds=1.0))
         await operator.call("lead", seconds=0.8)
-        return bool((await following).values["count"])
+        return bool((await following).values.get("count"))
 
 
 @pytest.mark.parametrize(
@@ -120,6 +121,41 @@ async def test_keys_are_replaced_host_by_host_without_an_outage(tmp_path: Path, 
     finally:
         for node in list(hosts.nodes):
             hosts.stop(node)
+
+
+async def test_new_processes_of_a_node_use_the_keys_that_it_began_with(tmp_path: Path) -> None:
+    hosts = Hosts(tmp_path, "shared key")
+    keys = PASSES["shared key"][0]
+    try:
+        for node in ("left", "right"):
+            await asyncio.to_thread(hosts.restart, node, keys)
+            (tmp_path / node / "old").unlink()
+            kill(below(hosts.nodes[node].pid))
+        await hosts.works(keys)
+    finally:
+        for node in list(hosts.nodes):
+            hosts.stop(node)
+
+
+async def test_a_node_logs_why_a_stream_cannot_be_sent(tmp_path: Path) -> None:
+    hosts = Hosts(tmp_path, "shared key")
+    passes = PASSES["shared key"]
+    try:
+        await asyncio.to_thread(hosts.restart, "left", passes[2])
+        await asyncio.to_thread(hosts.restart, "right", passes[0])
+        path = await asyncio.to_thread(hosts.write, "coordinator", passes[1])
+        operator = GuardedOperator(parse(path.read_text(), path))
+        try:
+            await operator.connect("right")
+            await operator.call("lead", seconds=3.0)
+        finally:
+            await operator.close()
+    finally:
+        for node in list(hosts.nodes):
+            hosts.stop(node)
+    says = "stream points: left does not tell where it goes: unreachable"
+    assert says in (log := (tmp_path / "right" / "right.log").read_text())
+    assert log.count(says) < 4, log
 
 
 @pytest.mark.parametrize(

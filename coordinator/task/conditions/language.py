@@ -376,5 +376,5 @@ def _explain(sign: str) -> str:
     if sign in "\"'":
         return "this string is not closed"
     return f"{sign!r} has no meaning in a condition" + (
-        f" ({hints[sign]})" if sign in hints else ""
+        f" ({hints[sign]})" if sign in hints else "; leave it out"
     )

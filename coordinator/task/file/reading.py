@@ -206,7 +206,7 @@ class Table:
             self.fault(
                 name,
                 f"{text!r} is none of {', '.join(words)}",
-                nearest(text, list(words)).strip(" ()"),
+                nearest(text, list(words)).strip(" ()") or "write one of these",
             )
             return first
 
@@ -284,7 +284,9 @@ def read_text(path: Path) -> str:
     try:
         data = path.read_bytes()
     except OSError as error:
-        near = nearest(path.name, [other.name for other in path.parent.glob("*.toml")])
+        near = ""
+        if isinstance(error, FileNotFoundError):
+            near = nearest(path.name, [other.name for other in path.parent.glob("*.toml")])
         remedy = f"check the path and its permissions{near}"
         fault = Fault("file", f"cannot be read: {error.strerror}", remedy)
         raise TaskFileError(str(path), [fault], [0]) from error

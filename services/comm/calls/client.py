@@ -56,6 +56,8 @@ KEY_CODES = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
 """Refusals (docs/protocol.md) of a peer with another key."""
 _LASTING = _FOR_GOOD.union(KEY_CODES, ("directory", "old_epoch"))
 """Refusals that stay until a person has changed something."""
+_FOREIGN = ("malformed", "unknown_kind", "too_large")
+"""What the first bytes of a program that is not a node of petrobot look like."""
 _EXPIRED = 10
 """X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
 _NOT_YET_VALID = 9
@@ -357,6 +359,8 @@ class Client:
         if self.tls is not None and not link.welcome and link.refusal is None:
             # In TLS 1.3 the client's handshake ends before the server has checked its certificate.
             link.reason += f"; {NOT_TRUSTED}"
+        if not link.welcome and link.refusal is None and link.reason.startswith(_FOREIGN):
+            link.reason += ": is it a node of petrobot?"
         self.trouble = link.reason
         serving = self._task is not None and not self._task.done()  # not ended by `close`
         # One try after the other may fail.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from petrobot.services.comm.protocol.messages import COORDINATOR
-from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml
+from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml, shortened
 
 SCHEMA = 1
 Tables = dict[str, dict[str, Any]]
@@ -183,7 +183,7 @@ class Faults:
     def add(self, key: str, fault: str) -> None:
         """Add a fault of a key, given as "table.name.key"."""
         line = line_of(key, key_lines(self._text))
-        self.lines.append(f"{self._source}:{line}: {key}: {fault}")
+        self.lines.append(f"{self._source}:{line}: {key}: {shortened(fault)}")
 
 
 def read(

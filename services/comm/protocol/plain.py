@@ -85,12 +85,14 @@ def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
     if kind is int:
         if not _INT_MIN <= value <= _INT_MAX:
             shown = value if value.bit_length() <= _SHORT_INT else f"of {value.bit_length():,} bits"
-            raise NotPlainError(f"{where}: the integer {shown} does not fit in 64 bits")
+            raise NotPlainError(
+                f"{where}: the integer {shown} does not fit in 64 bits; use a float or a text"
+            )
         return value
     if kind is not list and kind is not tuple and kind is not dict:
         return _plain_other(value, where, depth, left)
     if depth == 0:
-        raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels")
+        raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels; flatten it")
     left[0] -= 1
     if left[0] < 0 or len(value) > LARGEST:
         most = f"{MAX_CONTAINERS:,} lists and dicts" if left[0] < 0 else f"{LARGEST:,} items"
@@ -108,7 +110,7 @@ def _plain_dict(
     copy: dict[str, Any] = {}
     for key, item in value.items():
         if type(key) is not str:
-            raise NotPlainError(f"{where}: the key {_shown(key)} is not a str")
+            raise NotPlainError(f"{where}: the key {_shown(key)} is not a str; use str()")
         kind = type(item)
         if kind in _SIMPLE or (kind is int and -_INT64 <= item < _INT64):
             copy[key] = item  # as `_plain`, without building the name of the position
@@ -136,7 +138,7 @@ def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
     if is_numpy(value, "generic"):
         if value.dtype.kind in _NUMPY_KINDS and not is_numpy(item := value.item(), "generic"):
             return _plain(item, where, depth, left)
-        raise NotPlainError(f"{where}: a numpy {value.dtype.name} is not plain data")
+        raise NotPlainError(f"{where}: a numpy {value.dtype.name} is not plain data; use float()")
     for base, convert in _BASES:
         if isinstance(value, base):
             return _plain(convert(value), where, depth, left)

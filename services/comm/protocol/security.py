@@ -172,15 +172,21 @@ def write_key(path: Path, key: bytes) -> None:
 
 
 def read_secret(path: Path) -> bytes:
-    """Read a file that only its owner may read. Raises KeyFileError if others may, OSError if it
-    cannot be read.
+    """Read a file that only its owner may read. Raises KeyFileError if others may, or if this user
+    may not, OSError if it cannot be read.
 
     The file is opened once, and the opened file is checked, not its name: a name could lead to
     another file a moment later. A symbolic link is followed, because a user who can write
     services.toml could name any file anyway; the owner of the final file decides.
     """
     # O_NONBLOCK: opening a named pipe must not block.
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except PermissionError:
+        raise KeyFileError(
+            f"{path}: this user (uid {os.geteuid()}) may not read it; run this as the user who "
+            f"owns it, or `chown {os.geteuid()} {path}` as root"
+        ) from None
     with os.fdopen(handle, "rb") as file:
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):

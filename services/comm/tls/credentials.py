@@ -135,14 +135,15 @@ def _no_password() -> str:
     raise OSError(0, "its private key has a password: no node can type one")
 
 
-def credentials(directory: Directory, party: str) -> Credentials:
-    """Return the credentials of a node or the coordinator.
+def credentials(directory: Directory, party: str, key: Keys | None = None) -> Credentials:
+    """Return the credentials of a node or the coordinator. `key` is the shared key, if this process
+    was given it; otherwise it is read from its file.
 
     Raises KeyFileError when the files that services.toml names cannot be used.
     """
     keys = directory.keys
     if "certificates" not in keys:
-        return Credentials(party, shared_keys(directory))
+        return Credentials(party, key or shared_keys(directory))
     also = directory.file(keys["also"]) if "also" in keys else None
     return Credentials(party, None, directory.file(keys["certificates"]), also)
 

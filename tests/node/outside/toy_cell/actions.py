@@ -223,9 +223,9 @@ def segfault(ctx: Context) -> Result:
     return success()
 
 
-def leave(ctx: Context) -> Result:
+def leave(ctx: Context, *, code: int = 7) -> Result:
     """End the whole process."""
-    os._exit(7)
+    os._exit(code)
 
 
 def eat(ctx: Context, *, megabytes: int) -> Result:
