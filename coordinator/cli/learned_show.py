@@ -484,11 +484,11 @@ def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]
             met = ", ".join(map(_named, row["scenarios"])) or "none"
             most = f", where it costs {_cell(row['C_largest'])} at most" if row["scenarios"] else ""
             lines.append(f"{row['action']} meets R {about['target']:g} in: {met}{most}")
-        if row["causes"]:
-            lines.append(
-                f"{row['action']}: "
-                + ", ".join(f"{n} {cause}" for cause, n in row["causes"].items())
-            )
+        told = [f"{n} {cause}" for cause, n in row["causes"].items()]
+        if row["unjudged"]:
+            told.append(f"{row['unjudged']} not judged, which do not count in R")
+        if told:
+            lines.append(f"{row['action']}: {', '.join(told)}")
     lines += [
         f"{b['against']} is better than {about['best']} {b['better']} rho = {b['rho']:.4g}"
         for b in about["break_even"]

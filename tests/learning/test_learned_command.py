@@ -377,6 +377,26 @@ def test_notes_explain_what_the_table_cannot_show(
     assert "no run reported" not in text
 
 
+def test_runs_that_nobody_has_judged_are_shown_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They have no part in R; an action all of whose runs are such is not compared."""
+    open_ = Observation(Status.SUCCESS, 1.0, judged=False)
+    some = {"A": tally_of([Observation(Status.FAILURE, 1.0, "late"), open_, open_])}
+    path = file_of(
+        tmp_path / "x.db", one=some, two={"A": tally_of([open_])}, three=shares(1.0, A=(3, 1))
+    )
+    shown, text = told(path, capsys)
+    rows = {row["action"]: row for row in shown["pick"]["actions"]}
+    assert [(a, r["runs"], r["unjudged"], r["R"]) for a, r in sorted(rows.items())] == [
+        ("one", 1, 2, 0.0),
+        ("three", 4, 0, 0.75),
+        ("two", 0, 1, None),
+    ]
+    assert "one: 1 failure: late, 2 not judged, which do not count in R" in text
+    assert shown["pick"]["best"] == "three"
+
+
 def test_a_run_warns_that_a_cost_was_never_reported(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
