@@ -222,7 +222,8 @@ async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopp
         elif stopped.answered:
             stopped.latch = ""  # The node was only late, and stores the stop itself.
         if verb == CLEAR and not stopped.answered and not (line and line.reached):
-            stopped.latch, stopped.cleared = await _unlatch(directory, node)
+            said, stopped.cleared = await _unlatch(directory, node)
+            stopped.latch = f"{stopped.why or 'it does not answer'}; {said}" if said else ""
     finally:
         if line is not None:
             await line.close()
@@ -284,11 +285,7 @@ async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
         await asyncio.to_thread(latch_of(directory.source, node).clear, devices, devices)
     except LatchError as fault:
         return f"not cleared: {fault}", False
-    return (
-        "it does not answer; its stop is cleared on disk, so its devices accept orders once it "
-        "runs",
-        True,
-    )
+    return "its stop is cleared on disk, so its devices accept orders once it runs", True
 
 
 def still_stopped(directory: Directory) -> list[str]:
