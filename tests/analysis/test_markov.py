@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import erlang
 
-from petrobot.coordinator.analysis.net.graph import Mask
+from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.completion import (
     completion,
@@ -20,7 +20,7 @@ from petrobot.coordinator.analysis.time.completion import (
     time_slopes,
 )
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, TimelessTrap, Values
-from petrobot.coordinator.analysis.time.linear import stationary
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
 from petrobot.coordinator.analysis.time.markov import (
     Generator,
     long_run,
@@ -289,6 +289,33 @@ def test_completion_of_a_large_component_by_gauss_seidel() -> None:
         step = (1 + down * step) / up
         total += step
     assert done.mean == pytest.approx(total, rel=1e-9)
+
+
+@pytest.mark.parametrize("keep", [0.99, 0.999])
+@pytest.mark.parametrize("edges", ["forward", "backward"])
+def test_a_component_on_which_aggregation_diverges_is_still_solved(keep: float, edges: str) -> None:
+    """Two loops of 30 and 31 stages side by side: the error differs within each block."""
+    state = np.arange(30 * 31)
+    one, other = (state + 31) % 930, state - state % 31 + (state + 1) % 31
+    ends = np.repeat(state, 2), np.stack([one, other], axis=1).ravel()
+    source, target = ends if edges == "forward" else ends[::-1]
+    order = np.argsort(source, kind="stable")
+    value = np.tile([0.1 * keep, 0.9 * keep], 930)[order]
+    first = np.zeros(930)
+    first[0] = 1.0
+    graph = Graph(930, source[order].astype(np.int32), target[order].astype(np.int32))
+    x = solve(SolveOrder.of(graph, None), value, first)
+    matrix = np.eye(930)
+    np.subtract.at(matrix, (graph.source, graph.target), value)
+    assert np.allclose(matrix @ x, first, atol=1e-12)
+
+
+def test_a_linear_system_without_a_finite_solution_is_an_error_not_a_warning() -> None:
+    """Each visit leads to ten more, 400 stages long."""
+    line = np.arange(400, dtype=np.int32)
+    graph = Graph(400, line[:-1], line[1:])
+    with pytest.raises(ArithmeticError):
+        solve(SolveOrder.of(graph, None), np.full(399, 10.0), np.ones(400))
 
 
 @pytest.mark.parametrize("mean", [0.0, 1e-3, 1.0, 30.0, 5e4])

@@ -26,6 +26,8 @@ from petrobot.coordinator.analysis.time.gspn import Values
 
 DENSE = 600
 """Vertices up to which a component is solved by dense elimination."""
+DIRECT = 10_000
+"""Vertices up to which a component on which coarse steps fail is solved by sparse elimination."""
 SWEEPS = 20_000
 """The most sweeps of Gauss-Seidel."""
 TOLERANCE = 1e-14
@@ -103,8 +105,12 @@ def _split(
     return waves
 
 
+@np.errstate(over="raise", invalid="raise", divide="raise")
 def solve(plan: SolveOrder, value: Values, b: Values) -> Values:
-    """Solve x = b + A x, with A given by `value` on the edges; b and x of shape (n,) or (n, k)."""
+    """Solve x = b + A x, with A given by `value` on the edges; b and x of shape (n,) or (n, k).
+
+    Raises ArithmeticError if the iteration does not converge, or a number overflows.
+    """
     graph = plan.graph
     x = np.zeros_like(b, dtype=np.float64)
     for single, groups in plan.waves:
@@ -169,30 +175,43 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
     change through the whole component. Where that converges slowly, a coarse step (see Coarse)
     removes the part of the error that is nearly constant over blocks of neighbours.
     """
+    from scipy.sparse import csc_array, eye_array
+    from scipy.sparse.linalg import splu
+
     factor, lower = triangular(n, rows, columns, value)
     coarse, x = Coarse(n, rows, columns), factor.solve(right)
     inverse: Values | None = None
+    helps, last = True, inf
     for k in range(SWEEPS):
         keep_time("linear system")
         before = x
         x = factor.solve(right + lower @ x)
-        if np.max(np.abs(x - before)) <= TOLERANCE * max(1e-300, float(np.max(np.abs(x)))):
+        moved = float(np.max(np.abs(x - before)))
+        if moved <= TOLERANCE * max(1e-300, float(np.max(np.abs(x)))):
             return np.asarray(x)
-        if coarse.is_due(k):
+        if not coarse.is_due(k):
+            continue
+        # The error may differ too much within the blocks: then coarse steps enlarge it, without a
+        # bound. Sweeps alone always converge (I - A is an M-matrix), but slowly.
+        helps, last = helps and moved < last, moved
+        if not helps and n <= DIRECT:
+            matrix = eye_array(n, format="csc") - csc_array((value, (rows, columns)), shape=(n, n))
+            return np.asarray(splu(csc_array(matrix)).solve(right))
+        if helps:
             inverse = coarse.inverse(value) if inverse is None else inverse
             x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)
-    raise NotConverged(
-        f"Gauss-Seidel still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps"
-    )
+    raise NotConverged(f"Gauss-Seidel still moved by {moved:.2e} after {SWEEPS} sweeps")
 
 
+@np.errstate(over="raise", invalid="raise", divide="raise")
 def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
     """Return the probability vector nu = nu P of an irreducible stochastic matrix P.
 
     P is given by its entries. Small ones by GTH elimination, others by Gauss-Seidel with
     aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F. McAllister, W. J.
     Stewart, Iterative methods for computing stationary distributions of nearly completely
-    decomposable Markov chains, SIAM J. Alg. Disc. Meth. 5, 1984). Raises NotConverged.
+    decomposable Markov chains, SIAM J. Alg. Disc. Meth. 5, 1984). Raises ArithmeticError,
+    as `solve`.
     """
     if n == 1:
         return np.ones(1)

@@ -85,6 +85,13 @@ class Play:
         free = [m for m in structure.moves if all(known[q] for q in m.starts)]
         self._quick = [m for m in free if not m.waits]
         self._slow = [m for m in free if m.waits and not m.cause]
+        self._certain = [
+            m
+            for m in self._quick
+            if (m.normal or m.error)
+            and (m.allowed is not None or structure.task.transitions[m.name].when is None)
+        ]
+        """Transitions that take an ended run and surely fire as soon as the marking allows it."""
         contested = contested_places([m.transition for m in structure.moves])
         self._contests = [
             (i, place, weight)
@@ -167,6 +174,8 @@ class Play:
             able = np.array([self._enabled(m) for m in self._quick])
             some: Mask = np.asarray(able.any(axis=0))
             if not some.any():
+                if self._release():
+                    continue
                 self._note_waits()
                 return
             # What one firing makes fireable comes after what was fireable with it.
@@ -181,6 +190,20 @@ class Play:
             f"{self._s.task.name}: transitions fire for ever without time going on; run "
             "petrobot check"
         )
+
+    def _release(self) -> bool:
+        """Let ended runs leave by a transition that surely fires in the engine, where their
+        measured one is not enabled. The measured one may belong to another marking, such as another
+        number of used tries. Return whether any run may leave now."""
+        held = (self._want >= 0) & (self._phase == DONE)
+        if not held.any():
+            return False
+        measured, released = self._want, np.zeros_like(held)
+        self._want = np.where(held, -1, measured)
+        for m in self._certain:
+            released[[*m.normal, *m.error]] |= self._enabled(m)
+        self._want = np.where(released, -1, measured)
+        return bool((held & released).any())
 
     def _first(self, able: Mask) -> Codes:
         """Return which of the fireable transitions fires next in each column. As in the engine:

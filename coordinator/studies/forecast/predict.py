@@ -351,7 +351,7 @@ class _SimulatedNet:
         self._training = training
         # steps after which a simulated trial counts as endless
         longest = max(len(trial.runs) + len(trial.waits) for trial in training.trials)
-        self._longest = 100 + 20 * longest
+        self._longest = 100 + 5 * longest
 
     def played(
         self, choices: Choices, weights: Values, replicate: Codes, random: np.random.Generator

@@ -57,7 +57,8 @@ def forecast_text(made: Mapping[str, Any]) -> str:
                     f"other: p = {found['p']:.1e}"
                 )
         lines.append(f"    simulated net: {said['contexts']} contexts; {_worst(said)}")
-        if 0.0005 < said["endless"] <= NEGLIGIBLE:
+        # else a doubt says it, if the figures come from the simulated net
+        if said["endless"] > 0.0005 and (said["endless"] <= NEGLIGIBLE or said["from"] == TRIALS):
             lines.append(f"    note: {said['endless']:.1%} of the simulated trials never end")
         lines += [f"    note: {note}" for note in (*said["notes"], *said["assumptions"])]
         lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]

@@ -635,6 +635,37 @@ b_lost: b:error -> lost
     assert any(text.startswith("a.retry: its condition") for text in structure.assumptions)
 
 
+def test_a_run_with_tries_ends_beside_a_branch_that_goes_on_for_ever() -> None:
+    """Runs were taken after one try or after two. A simulated run may want the transition of
+    another number of tries; it leaves by the one that the marking allows, at once."""
+    text = """
+[places.heard]
+kind = "control"
+tokens = 1
+begin: jobs -> a
+done: a:normal -> end
+a_lost: a:error -> end
+press: heard -> b
+b_done: b:normal -> heard
+b_lost: b:error -> heard
+"""
+    keys = with_transitions(HEAD.replace("{task}", GOAL) + text)
+    keys = keys.replace('\ntask = "a"', '\ntask = "a"\ntries = 3')
+    task = loads(keys.replace('\ntask = "b"', '\ntask = "b"\nlisten = true'), "net.toml")
+    trials = []
+    for n in (1, 1, 2, 3):
+        ways = [("error", "a.retry")] * (n - 1) + [("success", ("done", "done.1", "done.2")[n - 1])]
+        tries = [entry("a", 1.0, status, taken=taken) for status, taken in ways]
+        trials.append(Trial(1, 0.0, runs=[*tries, *[entry("b", 0.7, taken="b_done")] * n]))
+    training = Training.of(task, trials)
+    drawer = Drawer(RunDistributions(training), {}, np.ones((1, 4)), np.random.default_rng(1))
+    structure = Structure.of(training.task)
+    replicate = np.zeros(1000, np.int64)
+    played = Play(structure, drawer, choices_of(training), replicate, longest=100).run()
+    assert played.completed.all()
+    assert set(played.time.tolist()) == {1.0, 2.0, 3.0}
+
+
 def test_an_estimates_file_that_leaves_a_condition_open_is_doubtful() -> None:
     """Which way a run leaves is decided by a cause that the file does not have for each run."""
     text = """
