@@ -14,7 +14,7 @@ import os
 import signal
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,6 @@ from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import LIMITS, Driver, QuickStopping, keys_of
 from petrobot.services.rehearsal import TestPorts
-from petrobot.services.worker.setpoints import SetpointReceiver
 
 Command = Mapping[str, Any]
 REST, PART = 20, 0.25
@@ -107,12 +106,14 @@ def check_driver(
     """
     clock: Any = _Clock() if simulated else time
     if isinstance(make, type):
-        make = partial(_without_ports, make)
+        make = partial(_made, make, clock.monotonic)
     check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions)
     try:
         check.rules(commands, seconds, cable)
         if isinstance(clock, _Clock):
             check.seeds(clock, commands)
+    except _TooLongError as fault:
+        check.fault(str(fault))
     except Exception as fault:
         check.fault(f"the driver raised {type(fault).__name__}: {fault}")
     finally:  # also after Ctrl-C: the device may be moving
@@ -120,19 +121,17 @@ def check_driver(
     return check.found
 
 
-def _without_ports(kind: Callable[..., Driver], **keys: Any) -> Driver:
-    return kind(keys, None)
+def _made(kind: Callable[..., Driver], clock: Callable[[], float], **keys: Any) -> Driver:
+    return kind(keys, TestPorts(clock))
 
 
 def _with_ports(make: Callable[..., Driver], clock: Callable[[], float]) -> Callable[..., Driver]:
-    """The same, with ports for a driver that has none."""
+    """The same; a driver that was made with ports None gets the clock of the check."""
 
     @wraps(make)
     def made(**keys: Any) -> Driver:
         driver = make(**keys)
-        if getattr(driver, "ports", make) is None:
-            silent = SetpointReceiver(1.0, clock)
-            driver.ports = TestPorts(clock, [], lambda name: silent)
+        TestPorts.of(driver).begin(clock, [], defaultdict(lambda: 1.0))
         return driver
 
     return made
@@ -181,6 +180,10 @@ class _Clock:
 
     def sleep(self, seconds: float) -> None:
         self.passed += seconds
+
+
+class _TooLongError(Exception):
+    """A movement is not at its end after `seconds`: nothing after it could be judged."""
 
 
 class _Check:
@@ -376,7 +379,7 @@ class _Check:
             return
         far = {n: begin[n] - v for n, v in self.numbers().items() if n in positions.keys() & begin}
         fastest = self.fastest
-        self.arrived(there, positions)
+        self.arrived(there, positions, seconds)
 
         def begun() -> None:
             self.move(there, seconds, judged=False)
@@ -419,15 +422,20 @@ class _Check:
             self.stands(f"after {dict(there)}")
             self.note(f"stop and hold during {dict(there)}: it changes the state at once")
 
-    def arrived(self, there: Command, positions: Mapping[str, float]) -> None:
-        """Judge whether the device stands at the end of a movement."""
-        self.run(self.within, self.stopped)
+    def arrived(self, there: Command, positions: Mapping[str, float], seconds: float) -> None:
+        """Judge whether the device stands at the end of a movement. Raises _TooLongError."""
+        moving = self.run(self.within, self.stopped, positions)
         if self.stopped():
             self.stands(f"after {dict(there)}", positions)
         else:  # it may be one that runs until it is stopped, as a pump
             before = self.numbers()
             self.stop(f"stop after {dict(there)}", positions)
             if not _differ(before, self.numbers(), positions, PART):
+                if moving:
+                    raise _TooLongError(
+                        f"{dict(there)}: took longer than `seconds` = {seconds:g} s, so nothing "
+                        "more was checked; give a shorter command, or larger `seconds`"
+                    )
                 text = f"stopped() is still False after {self.within:g} s"
                 self.fault(f"after {dict(there)}: {text}")
 

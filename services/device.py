@@ -242,9 +242,14 @@ class Driver:
     paused: bool = False
     """The operator pauses: let the device stand still until it is False again, then continue."""
 
-    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
-        """Read the keys of the device's table. Raises ValueError with every wrong key."""
-        self.ports = ports
+    def __init__(self, config: Mapping[str, Any], ports: Ports | None) -> None:
+        """Read the keys of the device's table. With ports None, which is for tests, the driver gets
+        those of a rehearsal. Raises ValueError with every wrong key."""
+        if ports is None:
+            from petrobot.services.rehearsal import TestPorts  # here: only a test needs it
+
+            ports = TestPorts()
+        self.ports: Ports = ports
         for name, value in read_keys(type(self), config).items():
             setattr(self, name, value)
         self.limit(config)

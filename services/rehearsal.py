@@ -17,7 +17,6 @@ from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict
 from petrobot.services.comm.location_file import MEMORY_CALLS, ActionEntry
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Cancel, Event, Feedback, Outcome
-from petrobot.services.device import Driver
 from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.memory import GlobalMemory
 from petrobot.services.worker.context import Draws, Report, outcome_of, result_of
@@ -140,20 +139,39 @@ class _StillDevice:
 
 
 class TestPorts:
-    """Ports of a driver in a test, if it was made with ports None: a clock, `random`, and a
-    list of the events that it raises; `receiver` gives it streams."""
+    """Ports of a driver in a test, if it was made with ports None: a clock, `random`, `raise_event`
+    and streams. Until `begin`, they are those of `setup`: nothing arrives or can be drawn."""
 
     __test__ = False
 
-    def __init__(
+    def __init__(self, clock: Callable[[], float] = lambda: 0.0) -> None:
+        self._clock = clock
+        self._events: list[tuple[float, str, Mapping[str, Any]]] = []
+        self._periods: Mapping[str, float] = defaultdict(lambda: TICK)
+        self._receivers = dict[str, SetpointReceiver]()
+        self.random = Draws("device").random
+
+    @classmethod
+    def of(cls, driver: Any) -> TestPorts:
+        """Return the ports of a driver that was made with ports None; of any other device, ports
+        that it does not see."""
+        if getattr(driver, "ports", cls) is None:  # its own constructor keeps what it is given
+            driver.ports = cls()
+        ports = getattr(driver, "ports", None)
+        return ports if isinstance(ports, cls) else cls()
+
+    def begin(
         self,
         clock: Callable[[], float],
         events: list[tuple[float, str, Mapping[str, Any]]],
-        receiver: Callable[[str], SetpointReceiver],
+        periods: Mapping[str, float],
         seed: int = 0,
     ) -> None:
-        self._clock, self._events, self.stream = clock, events, receiver
+        """Begin a test; the driver may have opened streams in its `setup`, and be used again."""
+        self._clock, self._events, self._periods = clock, events, periods
         self.random = Draws("device", seed).random
+        for name, receiver in self._receivers.items():
+            receiver.begin(periods[name])
 
     @property
     def now(self) -> float:
@@ -163,6 +181,12 @@ class TestPorts:
     def raise_event(self, name: str, **data: Any) -> None:
         """Record the event."""
         self._events.append((self.now, name, data))
+
+    def stream(self, name: str) -> SetpointReceiver:
+        """The receiving end of a stream."""
+        if name not in self._receivers:
+            self._receivers[name] = SetpointReceiver(self._periods[name], lambda: self.now)
+        return self._receivers[name]
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"a test has no ports.{name}; make the driver with ports that do")
@@ -181,11 +205,9 @@ class _Stage:
     ) -> None:
         self.now = 0.0
         self.played = Rehearsal(error("still_running"), 0.0)
-        if isinstance(device, Driver) and getattr(device, "ports", self) is None:
-            clock, events = (lambda: self.now), self.played.events
-            device.ports = TestPorts(clock, events, self.receiver, seed)
+        self._ports = TestPorts.of(device)
+        self._ports.begin(lambda: self.now, self.played.events, streams, seed)
         self._services = services
-        self._streams, self._receivers = streams, dict[str, SetpointReceiver]()
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None
         self.place = InlineHost(
             {NAME: ActionEntry(NAME, "", "", "")},
@@ -196,13 +218,6 @@ class _Stage:
             substitutes={NAME: action},
             virtual=True,
         )
-
-    def receiver(self, stream: str) -> SetpointReceiver:
-        """What has arrived of a stream."""
-        if stream not in self._receivers:
-            period = self._streams[stream]
-            self._receivers[stream] = SetpointReceiver(period, lambda: self.now)
-        return self._receivers[stream]
 
     def step(self) -> bool:
         """Advance by one tick; return whether the run has ended."""
@@ -219,7 +234,7 @@ class _Stage:
             played.seconds = report.seconds
         elif isinstance(report, Sent):
             played.published.append((self.now, report.stream, report.values))
-            self.receiver(report.stream).take(report.values, report.elapsed)
+            self._ports.stream(report.stream).take(report.values, report.elapsed)
         elif isinstance(report, Event) and report.name.startswith(VERDICT_EVENTS):
             said = RunVerdict.of_data(report.data)
             played.verdicts.append((self.now, said.run, Status(said.status), said.cause))

@@ -139,6 +139,15 @@ def test_the_porter_runs(tmp_path: Path) -> None:
     porter = copied(ROOT / "examples" / "porter", tmp_path)
     files = [p.read_text(encoding="utf-8").splitlines() for p in porter.iterdir() if p.is_file()]
     assert sum(1 for lines in files for line in lines if line.strip()) <= 300
+    tested = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q"],
+        cwd=porter,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert tested.returncode == 0 and "4 passed" in tested.stdout, tested.stdout
     checked = petrobot(porter, "check", "deliver.toml")
     assert checked.returncode == 0 and "warning" not in checked.stdout, checked.stdout
     run = ("run", "deliver.toml", "--quiet", "--no-page", "--json", "-")

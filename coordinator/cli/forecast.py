@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole(20),
         default=400,
         metavar="B",
-        help="number of bootstrap samples (%(default)s)",
+        help="number of bootstrap samples, at least 20 (%(default)s)",
     )
     parser.add_argument(
         "--seed",

@@ -29,8 +29,12 @@ class SetpointReceiver:
     stream's messages."""
 
     def __init__(self, period: float, clock: Callable[[], float]) -> None:
-        self._limit = STALE_AFTER * period + SLACK
         self._clock = clock
+        self.begin(period)
+
+    def begin(self, period: float) -> None:
+        """Begin as if nothing had arrived; `period` is that of the stream (s)."""
+        self._limit = STALE_AFTER * period + SLACK
         self._values: tuple[float, ...] | None = None
         self._arrived = -math.inf
         self._published = -math.inf

@@ -20,8 +20,6 @@ from petrobot.services.comm.protocol.messages import Hello, Refuse
 from petrobot.services.device import LIMITS, can_move, keys_of
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.ports import ProcessPorts
-from petrobot.services.rehearsal import TestPorts
-from petrobot.services.worker.setpoints import SetpointReceiver
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -234,9 +232,7 @@ def test_the_drivers_of_the_examples_keep_the_rules(
     """With those of speed, workspace and dry run; the other shipped drivers have such a test with
     their simulated devices."""
     monkeypatch.syspath_prepend(ROOT / "examples" / folder)
-    kind, silent = resolve(driver), SetpointReceiver(1.0, lambda: 0.0)
-    ports = TestPorts(lambda: 0.0, [], lambda name: silent)
-    found = check_driver(lambda **keys: kind(keys, ports), commands, seconds=8.0, simulated=True)
+    found = check_driver(resolve(driver), commands, seconds=8.0, simulated=True)
     assert found.faults == []
 
 

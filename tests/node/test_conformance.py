@@ -81,7 +81,7 @@ class Ready(Driver):
     start: float = key(0.0, "m")
 
     def setup(self) -> None:
-        self.made = self.start, self.ports, self.speed
+        self.made = self.start, self.ports.now, self.speed
 
 
 COMMANDS = [{"to": 0.2}, {"to": 0.0}]
@@ -113,17 +113,21 @@ def test_the_base_class_holds_for_a_driver_that_obeys_paused() -> None:
 
 def test_a_driver_prepares_itself_when_its_keys_are_read() -> None:
     config = {"start": 0.1, "speed": 0.5}
-    assert type("Slow", (Ready,), {"obeys": ("speed",)})(config, NO_PORTS).made == (0.1, None, 0.5)
+    assert type("Slow", (Ready,), {"obeys": ("speed",)})(config, None).made == (0.1, 0.0, 0.5)
 
 
 def test_a_driver_without_ports_may_draw_read_a_stream_and_raise_events() -> None:
     class Notices(Axis):
+        def setup(self) -> None:
+            self.wish, self.made = self.ports.stream("wish"), self.ports.now
+
         def step(self, now: float) -> None:
             super().step(now)
-            if self.ports.random("hum").random() < 0.1 and self.ports.stream("wish").values is None:
-                self.ports.raise_event("hum", at=self.ports.now)
+            if self.ports.random("hum").random() < 0.1 and self.wish.values is None:
+                self.ports.raise_event("hum", after=self.ports.now - self.made)
 
     assert checked(Notices).faults == []
+    assert check_driver(Notices, COMMANDS, simulated=True).faults == []
 
 
 class Ages(Axis):
@@ -520,6 +524,13 @@ class Pump(Axis):
         return self.at == 0.0
 
 
+class NeverArrives(Axis):
+    """Stands, and says that it does not."""
+
+    def stopped(self) -> bool:
+        return False
+
+
 class Outputs(Axis):
     """It switches at once, and nothing moves."""
 
@@ -548,6 +559,16 @@ class Remembers(Axis):
 
     def state(self) -> Mapping[str, Any]:
         return {**super().state(), "past": [*self.past]}
+
+
+def test_a_movement_that_is_slow_is_not_the_drivers_fault() -> None:
+    """Its consequences are not reported as faults of their own."""
+    commands = [{"to": 0.8}, {"to": 0.0}]
+    found = check_driver(Obedient, commands, simulated=True)
+    assert len(found.faults) == 1
+    assert "took longer than `seconds` = 5 s" in found.faults[0]
+    assert check_driver(Obedient, commands, seconds=9.0, simulated=True).faults == []
+    assert "stopped() is still False after 1 s" in checked(NeverArrives).faults[-1]
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ async def try_door(ctx: Context[Remote], *, share: float) -> Result:
 
 
 def door() -> Door:
-    return Door({}, None)  # type: ignore[arg-type]  # a rehearsal gives it ports
+    return Door({}, None)
 
 
 def test_an_accepted_command_has_reached_the_driver_when_the_action_continues() -> None:

@@ -24,7 +24,7 @@ class Bare(Driver):
 
 
 def moved(**keys: Any) -> JointMotion:
-    return JointMotion(Bare(keys, None), LIMITS, 2.0, 8.0, lambda q: (*q, 0.0))  # type: ignore[arg-type]
+    return JointMotion(Bare(keys, None), LIMITS, 2.0, 8.0, lambda q: (*q, 0.0))
 
 
 def arrive(motion: JointMotion, steps: int = 1000) -> int:
@@ -146,4 +146,4 @@ def test_without_speed_or_acceleration_it_would_never_move(
     speed: float, acceleration: float
 ) -> None:
     with pytest.raises(ValueError, match="speed and acceleration above 0"):
-        JointMotion(Bare({}, None), LIMITS, speed, acceleration)  # type: ignore[arg-type]
+        JointMotion(Bare({}, None), LIMITS, speed, acceleration)

@@ -164,7 +164,7 @@ def test_a_rehearsal_has_memory_and_streams_without_a_location_file() -> None:
             values = self.ports.stream("place").values
             self.shown = 0.0 if values is None else values[0]
 
-    desk = Desk({}, None)  # type: ignore[arg-type]
+    desk = Desk({}, None)
 
     async def tell(ctx: Context) -> Result:
         ctx.publish("place", [await ctx.get("parts")])
@@ -176,6 +176,29 @@ def test_a_rehearsal_has_memory_and_streams_without_a_location_file() -> None:
     played = rehearse(tell, device=desk, memory={"parts": 4})
     assert played.result.values == {"shown": 4.0}
     assert {(stream, values) for _, stream, values in played.published} == {("place", (4.0,))}
+
+
+def test_a_driver_may_open_a_stream_in_its_setup_and_be_rehearsed_twice() -> None:
+    class Desk(Driver):
+        def setup(self) -> None:
+            self.place = self.ports.stream("place")
+            with pytest.raises(ValueError, match="a driver is made before the seed is known"):
+                self.ports.random("noise")
+            with pytest.raises(AttributeError, match=r"a test has no ports\.file"):
+                self.ports.file("table.csv")
+
+    async def tell(ctx: Context, *, number: float) -> Result:
+        begin = ctx.device.place.values
+        ctx.publish("place", [number])
+        await ctx.sleep(0.95)
+        ctx.device.ports.raise_event("seen")
+        return success(begin=begin, end=ctx.device.place.values)
+
+    desk = Desk({}, None)
+    for number in (1.0, 2.0):
+        played = rehearse(tell, device=desk, streams={"place": 0.1}, number=number)
+        assert played.result.values == {"begin": None, "end": [number]}
+        assert [name for _, name, _ in played.events] == ["seen"]
 
 
 @pytest.mark.processes
