@@ -303,7 +303,7 @@ def test_a_component_on_which_aggregation_diverges_is_still_solved(keep: float, 
     value = np.tile([0.1 * keep, 0.9 * keep], 930)[order]
     first = np.zeros(930)
     first[0] = 1.0
-    graph = Graph(930, source[order], target[order])
+    graph = Graph(930, source[order].astype(np.int32), target[order].astype(np.int32))
     x = solve(SolveOrder.of(graph, None), value, first)
     matrix = np.eye(930)
     np.subtract.at(matrix, (graph.source, graph.target), value)
@@ -312,7 +312,8 @@ def test_a_component_on_which_aggregation_diverges_is_still_solved(keep: float, 
 
 def test_a_linear_system_without_a_finite_solution_is_an_error_not_a_warning() -> None:
     """Each visit leads to ten more, 400 stages long."""
-    graph = Graph(400, np.arange(399), np.arange(1, 400))
+    source = np.arange(399, dtype=np.int32)
+    graph = Graph(400, source, source + np.int32(1))
     with pytest.raises(ArithmeticError):
         solve(SolveOrder.of(graph, None), np.full(399, 10.0), np.ones(400))
 
