@@ -196,7 +196,10 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
         helps, last = helps and moved < last, moved
         if not helps and n <= DIRECT:
             matrix = eye_array(n, format="csc") - csc_array((value, (rows, columns)), shape=(n, n))
-            return np.asarray(splu(csc_array(matrix)).solve(right))
+            try:
+                return np.asarray(splu(csc_array(matrix)).solve(right))
+            except RuntimeError as fault:  # it is singular
+                raise NotConverged(f"no direct solution either: {fault}") from fault
         if helps:
             inverse = coarse.inverse(value) if inverse is None else inverse
             x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)

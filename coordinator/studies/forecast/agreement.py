@@ -61,7 +61,8 @@ def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> d
     controls, laws, ways, took = [], [], [], []
     for name in common:
         said, training = forecast["regimes"][name], regimes[name]
-        rows += [_row(name, figure, said, training) for figure in FAMILY]
+        family = [f for f in FAMILY if f != "R_goal" or training.task.flat.goal_transitions]
+        rows += [_row(name, figure, said, training) for figure in family]
         controls.append(_product(name, said, training))
         laws.append(_law(name, said, training))
         ways += _routing(name, said, training)

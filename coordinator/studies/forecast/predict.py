@@ -113,6 +113,8 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         if straight
         else _from_net(training, request, random)
     )
+    if not training.task.flat.goal_transitions:
+        del found["figures"]["R_goal"]
     return {
         "training_trials": len(training.trials),
         "training_runs": len(training.runs),

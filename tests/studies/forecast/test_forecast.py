@@ -243,6 +243,21 @@ def test_a_forecast_of_an_older_version_is_still_compared(pair: Task, make_trial
     assert mean["p"] == pytest.approx(2 * norm.sf(z), abs=0.01)
 
 
+@pytest.mark.parametrize("net", [None, True])
+def test_a_task_without_goals_has_no_share_of_goals(
+    pair: Task, make_trials: Make, net: bool | None
+) -> None:
+    """Nor has the comparison with a forecast of an older version, which still had a 0 there."""
+    task = replace(pair, goal_transitions=())
+    made = forecast(task, make_trials(200, np.random.default_rng(8)), net=net)
+    assert list(made["figures"]) == ["P_complete", "R_conj", "mean", "q90"]
+    older = {**made, "figures": {"R_goal": made["figures"]["R_conj"], **made["figures"]}}
+    new = {"": Training.of(task, make_trials(100, np.random.default_rng(9)))}
+    for said in (made, older):
+        rows = agreement({"regimes": {"": said}}, new)["rows"]
+        assert [row["figure"] for row in rows] == list(made["figures"])
+
+
 @pytest.mark.parametrize("figure", ["mean", "q90"])
 def test_a_time_at_the_end_of_its_interval_has_a_p_value_of_five_per_cent(
     pair: Task, make_trials: Make, figure: str
