@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial, wraps
+from importlib import import_module
 from inspect import signature
 from itertools import pairwise
 from pathlib import Path
@@ -104,6 +105,7 @@ def check_driver(
     then takes milliseconds. A driver that was made with ports None gets ports with a clock,
     `random`, `raise_event` and silent streams.
     """
+    import_module("numpy")  # a first draw must not count as a slow step
     clock: Any = _Clock() if simulated else time
     if isinstance(make, type):
         make = partial(_made, make, clock.monotonic)
@@ -184,6 +186,12 @@ class _Clock:
 
 class _TooLongError(Exception):
     """A movement is not at its end after `seconds`: nothing after it could be judged."""
+
+    def __init__(self, command: Command, seconds: float) -> None:
+        super().__init__(
+            f"{dict(command)}: took longer than `seconds` = {seconds:g} s, so nothing more was "
+            "checked; give a shorter command, or larger `seconds`"
+        )
 
 
 class _Check:
@@ -319,7 +327,9 @@ class _Check:
         else:
             self.refusal()
             for there, back in pairwise([*commands, *commands[:1]] if len(commands) > 1 else ()):
-                self.move(back, seconds)
+                way = self.move(back, seconds)
+                if way and self.run(self.within, self.stopped, way) and not self.stopped():
+                    raise _TooLongError(back, seconds)
                 self.rest()  # with its drives on, unlike before
                 self.movements(there, back, seconds)
             if len(commands) < 2:
@@ -432,10 +442,7 @@ class _Check:
             self.stop(f"stop after {dict(there)}", positions)
             if not _differ(before, self.numbers(), positions, PART):
                 if moving:
-                    raise _TooLongError(
-                        f"{dict(there)}: took longer than `seconds` = {seconds:g} s, so nothing "
-                        "more was checked; give a shorter command, or larger `seconds`"
-                    )
+                    raise _TooLongError(there, seconds)
                 text = f"stopped() is still False after {self.within:g} s"
                 self.fault(f"after {dict(there)}: {text}")
 

@@ -561,9 +561,11 @@ class Remembers(Axis):
         return {**super().state(), "past": [*self.past]}
 
 
-def test_a_movement_that_is_slow_is_not_the_drivers_fault() -> None:
+@pytest.mark.parametrize("commands", [[{"to": 0.8}, {"to": 0.0}], [{"to": 0.0}, {"to": 0.8}]])
+def test_a_movement_that_is_slow_is_not_the_drivers_fault(
+    commands: list[dict[str, float]],
+) -> None:
     """Its consequences are not reported as faults of their own."""
-    commands = [{"to": 0.8}, {"to": 0.0}]
     found = check_driver(Obedient, commands, simulated=True)
     assert len(found.faults) == 1
     assert "took longer than `seconds` = 5 s" in found.faults[0]
