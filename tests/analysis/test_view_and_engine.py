@@ -24,7 +24,7 @@ from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, execut
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import analyse
-from petrobot.coordinator.analysis.time.measured import Measured, Numbers, RunEnd, cut
+from petrobot.coordinator.analysis.time.measured import Measured, Numbers, OwnEnd, cut
 from petrobot.coordinator.analysis.time.simulate import goal_by_marking, simulate
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
@@ -960,7 +960,7 @@ def test_ends_at_the_deadline_have_its_fixed_time(measured: bool) -> None:
     task = with_deadline(1.0, 1, told=True)
     place, known = task.places["work"], Measured()
     estimates = Numbers(task, known).estimates(place, "work_a")
-    late = Numbers(task, known).ends(place, "work_a")[RunEnd(Status.ERROR, True)]
+    late = Numbers(task, known).ends(place, "work_a")[OwnEnd(Status.ERROR, True)]
     if measured:
         key, part = ("work", "work_a"), late.share / estimates[Status.ERROR].share
         runs, ends = {key: estimates}, {key: replace(late, share=part)}
@@ -968,7 +968,7 @@ def test_ends_at_the_deadline_have_its_fixed_time(measured: bool) -> None:
         known = Measured(runs, late=ends, causes={key: {Status.ERROR: causes}})
     numbers = Numbers(task, known)
     found = numbers.ends(place, "work_a")
-    own, late = found[RunEnd(Status.ERROR)], found[RunEnd(Status.ERROR, True)]
+    own, late = found[OwnEnd(Status.ERROR)], found[OwnEnd(Status.ERROR, True)]
     assert (late.mean, late.cv) == (1.0, 0.0) and own.mean < 1.0
     pooled = estimates[Status.ERROR]
     for power in (0, 1, 2):
@@ -978,7 +978,7 @@ def test_ends_at_the_deadline_have_its_fixed_time(measured: bool) -> None:
         ]
         assert moments[0] + moments[1] == pytest.approx(moments[2]), power
     examples = [("deadline", "yes"), ("slip", "yes")]
-    for end, cause in ((RunEnd(Status.ERROR, True), "deadline"), (RunEnd(Status.ERROR), "slip")):
+    for end, cause in ((OwnEnd(Status.ERROR, True), "deadline"), (OwnEnd(Status.ERROR), "slip")):
         assert numbers.endings(place, "work_a", end, examples, lambda e: e[0]) == {cause: 1.0}
     text = "of its ends with ERROR come at its deadline"
     few, many = stochastic_view(task, known), stochastic_view(task, known, stages=64)

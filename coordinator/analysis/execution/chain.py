@@ -38,7 +38,7 @@ from petrobot.coordinator.analysis.time.measured import (
     Measured,
     NoEstimate,
     Numbers,
-    RunEnd,
+    OwnEnd,
     is_cause,
 )
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit
@@ -513,7 +513,7 @@ class _Builder:
                     found.append((chosen * e.share, what, duration))
         return found
 
-    def what(self, place: Place, end: RunEnd, action: str) -> str:
+    def what(self, place: Place, end: OwnEnd, action: str) -> str:
         """Return what a clock of a run says: how it ends, and its action if that tells why."""
         actions = self._actions(place.name)
         causes = [self.numbers.causes(place, a).get(end.status, {}) for a in actions]
@@ -680,7 +680,7 @@ class _Builder:
         return sum(p for other, p in shares.items() if devices.get(other, "") == mine)
 
     def shares(
-        self, place: Place, action: str, end: RunEnd, given: list[tuple[RunEnded, _Outcome]]
+        self, place: Place, action: str, end: OwnEnd, given: list[tuple[RunEnded, _Outcome]]
     ) -> list[_Outcome]:
         """Return the outcomes of a run that ends in one way, with their shares.
 

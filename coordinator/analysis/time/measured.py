@@ -69,7 +69,7 @@ class Measured:
     been executed, because only their number over all causes was measured."""
 
 
-class RunEnd(NamedTuple):
+class OwnEnd(NamedTuple):
     """How a run ends by itself: its status, and whether its deadline ends it."""
 
     status: Status
@@ -84,7 +84,7 @@ NEVER = 1e-6
 tail of a distribution so far out."""
 LATE: Ending = ("deadline", str(Executed.YES))
 """Why a run ends that takes longer than its deadline."""
-AT_DEADLINE = RunEnd(Status.ERROR, True)
+AT_DEADLINE = OwnEnd(Status.ERROR, True)
 
 
 def cut(
@@ -192,17 +192,17 @@ class Numbers:
         """Return share, mean (s) and cv by status. Raises NoEstimate."""
         return self._estimates(place, action)[0]
 
-    def ends(self, place: Place, action: str) -> dict[RunEnd, Estimate]:
+    def ends(self, place: Place, action: str) -> dict[OwnEnd, Estimate]:
         """Return share, mean (s) and cv by how a run ends by itself. Raises NoEstimate."""
         known, late = self._estimates(place, action)
-        found = {RunEnd(s): e for s, e in known.items() if e.share > 0}
+        found = {OwnEnd(s): e for s, e in known.items() if e.share > 0}
         if late is None or not late.share:
             return found
         error = known[Status.ERROR]
         if error.share - late.share < NEVER * error.share:
-            found[AT_DEADLINE] = found.pop(RunEnd(Status.ERROR))
+            found[AT_DEADLINE] = found.pop(OwnEnd(Status.ERROR))
         elif self.apart and (own := _apart(error, late)) is not None:
-            found |= {RunEnd(Status.ERROR): own, AT_DEADLINE: late}
+            found |= {OwnEnd(Status.ERROR): own, AT_DEADLINE: late}
         else:
             self.assumptions.append(
                 f"{place.name}: {100 * late.share / error.share:.0f} % of its ends with ERROR come "
@@ -274,7 +274,7 @@ class Numbers:
         self,
         place: Place,
         action: str,
-        end: RunEnd,
+        end: OwnEnd,
         examples: Sequence[Ending],
         region: Callable[[Ending], K],
     ) -> dict[K, float]:
@@ -312,7 +312,7 @@ class Numbers:
         text += "; causes that lead to different firings are equally likely" * (len(equal) > 1)
         self.assumptions.append(text)
         found = dict.fromkeys(equal, 1.0 / len(equal))
-        if end == RunEnd(Status.ERROR) and late and not apart and region(LATE) in kinds:
+        if end == OwnEnd(Status.ERROR) and late and not apart and region(LATE) in kinds:
             share = late.share / estimates[Status.ERROR].share
             found = {kind: n * (1 - share) for kind, n in found.items()}
             found[region(LATE)] = found.get(region(LATE), 0.0) + share

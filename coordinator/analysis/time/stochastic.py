@@ -44,7 +44,7 @@ from petrobot.coordinator.analysis.time.measured import (
     Measured,
     NoEstimate,
     Numbers,
-    RunEnd,
+    OwnEnd,
     is_cause,
 )
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
@@ -562,7 +562,7 @@ class _Derivation:
 
     def _endings(
         self, place: Place, actions: Iterable[str], status: Status
-    ) -> dict[tuple[str, RunEnd], dict[EndKind, float]]:
+    ) -> dict[tuple[str, OwnEnd], dict[EndKind, float]]:
         """Return how probable each kind of end with a status is, by action and end."""
         asked, reason = self._asked(place, status), f"{place.name}.reason"
         literals = self._literals(reason)
@@ -578,11 +578,11 @@ class _Derivation:
             both = zip(FIELDS, told, strict=True)
             return tuple(value for field, value in both if f"{place.name}.{field}" in asked)
 
-        found: dict[tuple[str, RunEnd], dict[EndKind, float]] = {}
+        found: dict[tuple[str, OwnEnd], dict[EndKind, float]] = {}
         examples = list(product(reasons, executed))
         for action in actions:
             ends = [end for end in self.numbers.ends(place, action) if end.status is status]
-            for end in ends or [RunEnd(status)]:
+            for end in ends or [OwnEnd(status)]:
                 found[action, end] = (
                     self.numbers.endings(place, action, end, examples, kind)
                     if asked and ends
@@ -719,7 +719,7 @@ class _Derivation:
         self,
         place: Place,
         action: str,
-        end: RunEnd,
+        end: OwnEnd,
         estimate: Estimate,
         ends: Mapping[EndKind, float],
         shared: _Shared,
