@@ -89,7 +89,8 @@ async def _conducted(
 
     loop = asyncio.get_running_loop()
     until = loop.time() + PATIENCE
-    while not where.exists() and loop.time() < until:
+    # the scheduler creates the file before it writes it
+    while not (where.exists() and where.read_text().endswith("}")) and loop.time() < until:
         await beat(0)
     address = json.loads(where.read_text(encoding="utf-8"))["address"]
 
