@@ -70,9 +70,11 @@ def sheet_of(task: Task, inside: str, error_branches: bool, marking: Marking | N
 
 def expanded(task: Task) -> Task:
     """Return the net that is executed, to be drawn: nothing is written in short and no macro place
-    is closed. It gets a new layout if it has more elements than the task file."""
+    is closed. It gets a new layout if elements were added, or stood in a macro place."""
     flat = task.flat
-    if set(flat.places) == set(task.places) and set(flat.transitions) == set(task.transitions):
+    elements: list[Place | Transition] = [*flat.places.values(), *flat.transitions.values()]
+    drawn_as_written = not any(element.macro for element in elements)
+    if drawn_as_written and {*flat.places, *flat.transitions} == {*task.places, *task.transitions}:
         return task
     return replace(
         flat,

@@ -6,7 +6,7 @@ several machines add up. Reliability R is the relative frequency of SUCCESS amon
 executed, not censored and judged (paper, section 3). An ERROR counts as not successful, also with
 `executed = unknown`. An ERROR of a run that never executed lowers only the availability A. A
 preempted run that counts `none` is censored: it only shows that the run lasted at least so long. A
-run that ended provisionally and that nobody has judged says how such runs end and what they cost,
+run that ended provisionally and has no verdict says how such runs end and what they cost,
 but nothing about R.
 """
 
@@ -148,7 +148,7 @@ class Observation:
     """Seconds that its token was in the place beyond `seconds`: choosing the action, waiting for
     the device, messages on their way."""
     judged: bool = True
-    """False: its status is provisional, and nobody has judged it."""
+    """False: its status is provisional, and it has no verdict."""
 
     @property
     def exit(self) -> str:
@@ -191,7 +191,7 @@ class Tally:
     """Runs in `unknown`, by (exit, cause). Runs from files older than this are in `unknown`
     alone."""
     unjudged: Mapping[str, int] = field(default_factory=dict)
-    """Counted runs with a provisional status that nobody has judged, by that status. In files older
+    """Counted runs with a provisional status and no verdict, by that status. In files older
     than this they are not known."""
 
     # --- reading ------------------------------------------------------------------------------
@@ -438,7 +438,7 @@ class Tally:
                 for exit_, cause, n in data.get("unknown_ends", ())
             },
             {
-                Status(status).value: whole(n, "runs that nobody has judged")
+                Status(status).value: whole(n, "runs without a verdict")
                 for status, n in data.get("unjudged", {}).items()
             },
         )
@@ -457,7 +457,7 @@ class Tally:
                     "have a duration"
                 )
             open_ = self.unjudged.get(status.value, 0)
-            whole(open_, f"runs with {status} that nobody has judged", self.count(status))
+            whole(open_, f"runs with {status} and no verdict", self.count(status))
         whole(sum(self.unknown_ends.values()), "runs in unknown_ends", self.unknown)
         for (exit_, cause), n in self.unknown_ends.items():
             word = exit_.partition(":")[0]

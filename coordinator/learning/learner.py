@@ -376,7 +376,7 @@ class LearningSelector(FirstAlternative):
 
     def _finished(self, now: float, finished: Finished) -> None:
         """Judge the last tokens if the task came to its end, also by `final_error`, or if the goal
-        was met before the end. Of an aborted run nobody can say what it would have come to, so it
+        was met before the end. What an aborted run would have come to is not known, so it
         is censored; trials that were cut by the loss of another one are not recorded."""
         success, lost = finished.status is Status.SUCCESS, self._tokens.lost(finished)
         for trial in [*self._open.values()]:

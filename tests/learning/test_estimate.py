@@ -315,7 +315,7 @@ def test_numbers_that_no_sequence_of_runs_can_produce_are_refused(
 def test_every_tally_of_real_runs_is_accepted(
     seen: list[Observation], deferred: Observation, status: Status, others: list[Observation]
 ) -> None:
-    """This includes corrected and merged tallies, and those with runs that nobody has judged: the
+    """This includes corrected and merged tallies, and those with runs without a verdict: the
     check refuses no valid tally."""
     deferred = replace(deferred, judged=False)
     corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")

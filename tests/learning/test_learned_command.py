@@ -377,7 +377,7 @@ def test_notes_explain_what_the_table_cannot_show(
     assert "no run reported" not in text
 
 
-def test_runs_that_nobody_has_judged_are_shown_apart(
+def test_runs_without_a_verdict_are_shown_apart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """They have no part in R; an action all of whose runs are such is not compared."""

@@ -243,7 +243,7 @@ def test_first_trials_of_an_unavailable_action_end() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_selector_does_not_learn_from_a_run_that_nobody_has_judged(name: str) -> None:
+def test_a_selector_does_not_learn_from_a_run_without_a_verdict(name: str) -> None:
     selector = taught(make(name, ACTIONS), good=3)
     before = json.dumps(selector.state())
     selector.update("", "a", replace(success(), judged=False))

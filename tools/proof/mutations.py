@@ -301,7 +301,7 @@ MUTATIONS = (
         "tests/learning/test_estimate.py",
     ),
     _m(
-        "a selector learns from a run that nobody has judged",
+        "a selector learns from a run without a verdict",
         LEARNING + "selectors.py",
         "not in self.actions or not outcome.judged:",
         "not in self.actions:",

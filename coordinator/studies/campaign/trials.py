@@ -67,7 +67,7 @@ class RunEntry:
     """How much of `took` had passed when it was started: the wait for the run before it, for a
     choice and for its device. None: not known, as in tables that are older than this."""
     judged: bool = True
-    """False: its status is provisional, and nobody has judged it (not known in older tables)."""
+    """False: its status is provisional, and it has no verdict (not known in older tables)."""
 
     def to_plain(self) -> list[Any]:
         """Return a list in the order of the fields."""

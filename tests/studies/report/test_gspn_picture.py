@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,8 @@ from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.drawing.layout import COLUMN, ROW
 from petrobot.coordinator.drawing.scene import scene_of_net, scene_of_task
 from petrobot.coordinator.studies.report.gspn_picture import blocks_of, folded_chains, gspn_svg
+from petrobot.coordinator.task import Estimate, Status
+from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 
 
@@ -51,6 +54,15 @@ def test_a_duration_says_its_phases(view: StochasticView) -> None:
     drawn = gspn_svg(view, "Assumed: nothing.")
     assert "8 phases of" in drawn and "locate_ball.success.0a" in drawn
     assert "locate_ball.success.0a1" not in drawn
+
+
+def test_a_task_with_a_subnet_is_drawn_with_it_open() -> None:
+    porter = load(Path(__file__).parents[3] / "examples" / "porter" / "deliver.toml")
+    known = {status: Estimate(1 / 3, 1.0) for status in Status}
+    primitives = {n: replace(p, estimates=known) for n, p in porter.primitive_tasks.items()}
+    drawn = gspn_svg(stochastic_view(replace(porter, primitive_tasks=primitives)), "")
+    for name in ("fetch.drive.going", "fetch.watch.begin", "carry.drive.success", "grasp.begin"):
+        assert f'id="{name}"' in drawn, name
 
 
 def test_it_is_laid_out_as_the_task(view: StochasticView) -> None:
