@@ -187,11 +187,12 @@ class _Clock:
 class _TooLongError(Exception):
     """A movement is not at its end after `seconds`: nothing after it could be judged."""
 
-    def __init__(self, command: Command, seconds: float) -> None:
-        super().__init__(
-            f"{dict(command)}: took longer than `seconds` = {seconds:g} s, so nothing more was "
-            "checked; give a shorter command, or larger `seconds`"
-        )
+
+def _too_long(command: Command, seconds: float) -> _TooLongError:
+    return _TooLongError(
+        f"{dict(command)}: took longer than `seconds` = {seconds:g} s, so nothing more was "
+        "checked; give a shorter command, or larger `seconds`"
+    )
 
 
 class _Check:
@@ -329,7 +330,7 @@ class _Check:
             for there, back in pairwise([*commands, *commands[:1]] if len(commands) > 1 else ()):
                 way = self.move(back, seconds)
                 if way and self.run(self.within, self.stopped, way) and not self.stopped():
-                    raise _TooLongError(back, seconds)
+                    raise _too_long(back, seconds)
                 self.rest()  # with its drives on, unlike before
                 self.movements(there, back, seconds)
             if len(commands) < 2:
@@ -442,7 +443,7 @@ class _Check:
             self.stop(f"stop after {dict(there)}", positions)
             if not _differ(before, self.numbers(), positions, PART):
                 if moving:
-                    raise _TooLongError(there, seconds)
+                    raise _too_long(there, seconds)
                 text = f"stopped() is still False after {self.within:g} s"
                 self.fault(f"after {dict(there)}: {text}")
 
