@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, until
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    SLOW,
     add_estimates_argument,
     add_services_argument,
     cell_finder,
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
     from petrobot.coordinator.task.net import Net
 
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
-TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
-"""Seconds between two lines of progress; the first appears after as long."""
+TOLD_EVERY = 0.5
+"""Seconds between two lines of progress."""
 SECONDS, MEMORY = 60.0, 2 << 30
 """The most seconds and bytes of a command that has no options for them."""
 REASON_LETTERS = 150
@@ -162,7 +163,7 @@ def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
 
     def tell(found: int, expanded: int) -> None:
         now = time.monotonic()
-        if now - told[0] >= TOLD_EVERY and now - begun >= TOLD_AFTER:
+        if now - told[0] >= TOLD_EVERY and now - begun >= SLOW:
             told[0] = now
             print(
                 f"\r{found} markings found, {expanded} looked at, {now - begun:.0f} s "

@@ -21,6 +21,7 @@ from petrobot.coordinator.cli.loading import (
     load_directory,
     objections,
     task_path,
+    told_if_slow,
     write_json,
 )
 from petrobot.coordinator.task.wording import Severity, listed, wrapped
@@ -86,7 +87,8 @@ def run(options: argparse.Namespace) -> int:
     if read.value is None:
         raise _refused(options.json, task_path(options.task).stem, read, cell.faults)
     task, analysed = read.value, not read.unknown
-    judged, report = _checked(task, cell, code, analysed)
+    with told_if_slow("searching the states of the task (Ctrl-C: what is known by now)"):
+        judged, report = _checked(task, cell, code, analysed)
     if not services and not faults:
         report = _noted(report)
     if not analysed:

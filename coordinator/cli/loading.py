@@ -6,8 +6,9 @@ import hashlib
 import json
 import os
 import sys
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Timer
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
@@ -16,7 +17,7 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from petrobot.coordinator.analysis.may_run import Cell, MayRun
     from petrobot.coordinator.analysis.time.measured import Measured
@@ -31,6 +32,8 @@ UNKNOWN = "unknown"
 """Plant of runs in files that were written before plants were stored."""
 OWN = Path("tasks")
 """Folder of the user's own tasks; the operator's page saves there."""
+SLOW = 2.0
+"""Seconds after which a command says what it is doing."""
 
 
 def add_services_argument(parser: argparse.ArgumentParser) -> None:
@@ -256,7 +259,8 @@ def objections(task: Task, cell: Cell, judged: MayRun | None = None) -> list[str
         try:
             return list(json.loads(kept.read_text(encoding="utf-8")))
         except (OSError, ValueError):
-            judged = may_run.may_run(task, cell, may_run.BUDGET)
+            with told_if_slow(f"{task.name}: searching its states"):
+                judged = may_run.may_run(task, cell, may_run.BUDGET)
     found = judged.objections()
     if judged.analysis is not None and not judged.analysis.interrupted and kept.is_absolute():
         with suppress(OSError):
@@ -265,6 +269,18 @@ def objections(task: Task, cell: Cell, judged: MayRun | None = None) -> list[str
             for old in sorted(kept.parent.glob("*.json"), key=os.path.getmtime)[:-KEPT_ANSWERS]:
                 old.unlink()
     return found
+
+
+@contextmanager
+def told_if_slow(what: str) -> Iterator[None]:
+    """Say in the terminal what takes longer than SLOW."""
+    timer = Timer(SLOW, print, (f"{what} ...",), {"file": sys.stderr})
+    if sys.stderr.isatty():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def file_line(path: Path, key: str) -> str:

@@ -1,4 +1,4 @@
-"""Draw a task as SVG: places, transitions, tokens and events; error branches are hidden unless
+"""Draw a task as SVG or PNG: places, transitions, tokens and events; error branches are hidden unless
 asked for."""
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         default="-",
-        help="where to write the SVG, a file .svg (default: standard output)",
+        help="where to draw, a file .svg or .png (default: SVG to standard output)",
     )
 
 
@@ -69,8 +69,9 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.cli.analyse import bounded
 
     _refuse_idle(options)
-    if (suffix := Path(options.out).suffix) not in ("", ".svg"):
-        text = f"--out {options.out}: expected a file .svg, found {suffix}; drawings are SVG alone"
+    out = Path(options.out)
+    if out.suffix not in ("", ".svg", ".png"):
+        text = f"--out {out}: expected a file .svg or .png, found {out.suffix}"
         raise CommandError(2, text)
     drawn = _graph if options.graph else _gspn if options.view == "gspn" else _net
     with bounded(options.task):
@@ -79,11 +80,20 @@ def run(options: argparse.Namespace) -> int:
         print(svg)
         return 0
     try:
-        write_whole(Path(options.out), svg)
+        write_whole(out, _png(svg, out) if out.suffix == ".png" else svg)
     except OSError as fault:
-        text = f"{options.out}: {fault.strerror or fault}; give --out a file that can be written"
+        text = f"{out}: {fault.strerror or fault}; give --out a file that can be written"
         raise CommandError(2, text) from fault
     return 0
+
+
+def _png(svg: str, out: Path) -> bytes:
+    from petrobot.coordinator.studies.report.raster import RasterError, png
+
+    try:
+        return png(svg)
+    except RasterError as fault:
+        raise CommandError(2, f"{out}: no PNG: {fault}; or give --out a file .svg") from fault
 
 
 def _net(options: argparse.Namespace) -> str:

@@ -9,6 +9,7 @@ import os
 import re
 import resource
 import socket
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +21,7 @@ from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.cli import COMMANDS, Subcommand, main
 from petrobot.coordinator.cli import analyse as cli_analyse
+from petrobot.coordinator.cli import loading
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -514,6 +516,30 @@ def test_every_view_uses_the_devices_of_the_location_file(
     assert found[1][0] != found[0][0]
     assert main(["show", "shared.toml", "--services", "services.toml"]) == 2
     assert "--services is for --heat and --view gspn" in capsys.readouterr().err
+
+
+def test_check_says_what_takes_long(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A search of seconds is announced in a terminal, and nowhere else."""
+    monkeypatch.setattr(loading, "SLOW", 0.0)
+    assert main(["check", "catch_ball"]) == 0
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert main(["check", "catch_ball"]) == 0
+    assert "searching the states of the task" in capsys.readouterr().err
+
+
+def test_show_draws_png(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file .png is a picture of the same shape, for a paper or a mail."""
+    out = tmp_path / "net.png"
+    assert main(["show", "catch_ball"]) == 0
+    size = re.search(r'viewBox="[\d.-]+ [\d.-]+ ([\d.]+) ([\d.]+)"', capsys.readouterr().out)
+    assert main(["show", "catch_ball", "--out", str(out)]) == 0
+    data = out.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n" and size is not None
+    width, height = struct.unpack(">II", data[16:24])
+    assert width / height == pytest.approx(float(size[1]) / float(size[2]), rel=0.01)
 
 
 def test_show_draws_svg(capsys: pytest.CaptureFixture[str]) -> None:

@@ -947,7 +947,7 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
     (["arm_bot.toml"], r"unknown command .* \(did you mean 'run arm_bot.toml'\?\)"),
     (["rum", "arm_bot.toml"], r"unknown command 'rum' \(did you mean 'run'\?\)"),
     (["run", "arm_bot"], r"no task 'arm_bot': did you mean arm_bot.toml\?"),
-    (["show", TASK, "--out", "x.pdf"], r"--out x.pdf: expected a file .svg, found .pdf"),
+    (["show", TASK, "--out", "x.pdf"], r"--out x.pdf: expected a file .svg or .png, found .pdf"),
     (
         ["new", "robot", "arm_bot", "--folder", ".."],
         r"named 'arm_bot' is there already|exists already",
