@@ -1,5 +1,5 @@
-"""Draw a task as SVG or PNG: places, transitions, tokens and events; error branches are hidden unless
-asked for."""
+"""Draw a task as SVG or PNG: places, transitions, tokens and events; error branches are hidden
+unless asked for."""
 
 from __future__ import annotations
 

@@ -19,9 +19,8 @@ import pytest
 from petrobot.coordinator.analysis import commands
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
-from petrobot.coordinator.cli import COMMANDS, Subcommand, main
+from petrobot.coordinator.cli import COMMANDS, Subcommand, loading, main
 from petrobot.coordinator.cli import analyse as cli_analyse
-from petrobot.coordinator.cli import loading
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
