@@ -517,6 +517,7 @@ def test_every_view_uses_the_devices_of_the_location_file(
     assert "--services is for --heat and --view gspn" in capsys.readouterr().err
 
 
+@pytest.mark.processes
 def test_check_says_what_takes_long(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
