@@ -252,6 +252,9 @@ class _Check:
             self.fault(f"state: expected plain data, got {type(fault).__name__}: {fault}")
             return {}
         self.leaves = found = _leaves(state, LONGEST_ROW)
+        for name, value in found.items():
+            if isinstance(value, float) and math.isnan(value):
+                self.fault(f"state: {name} is NaN; what is not known yet is None, or left out")
         self.sizes.append(Counter({key: _size(value) for key, value in state.items()}))
         if self.sizes[-1].total() > LARGEST_STATE:
             self.fault(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import random
 import subprocess
 import threading
@@ -353,6 +354,12 @@ class TooLarge(Axis):
         return {**super().state(), "image": bytes(100_001)}
 
 
+class DividesByZero(Axis):
+    def state(self) -> Mapping[str, Any]:
+        moving = self.at != self.goal
+        return {**super().state(), "load": {"mean": 1.0 if moving else math.nan}}
+
+
 class LeavesAThread(Axis):
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
@@ -440,6 +447,7 @@ class DrawsByItself(Axis):
         (CatchesUp, "release: axis[0].at jumps instead of moving on"),
         (GoesOnAfterAStop, "release: the movement that was held and then stopped continues"),
         (Grows, "state: moves grows all the time"),
+        (DividesByZero, "state: load.mean is NaN; what is not known yet is None, or left out"),
         (TooLarge, "state: has more than 100,000 items and characters, most of them in image"),
         (LeavesAThread, "close: leaves a thread behind: reader"),
         pytest.param(
