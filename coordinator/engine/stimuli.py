@@ -226,9 +226,11 @@ class ForceExit:
 
 @dataclass(frozen=True, slots=True)
 class Abort:
-    """Operator: cancel every run, and end in ERROR when all have stopped."""
+    """Cancel every run, and end in ERROR when all have stopped: by the operator, by an emergency
+    stop, or because nothing could move the task on (`stuck`)."""
 
     reason: str = ""
+    stuck: bool = False
 
 
 Stimulus = (

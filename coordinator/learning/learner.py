@@ -245,7 +245,7 @@ class LearningSelector(FirstAlternative):
         elif isinstance(stimulus, RunEnded):
             self._run(now, stimulus.run).ended = stimulus
         elif isinstance(stimulus, Abort):
-            self._aborted = True
+            self._aborted = not stimulus.stuck
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Turn the executor's records into records of learning."""
@@ -376,8 +376,8 @@ class LearningSelector(FirstAlternative):
 
     def _finished(self, now: float, finished: Finished) -> None:
         """Judge the last tokens if the task came to its end, also by `final_error`, or if the goal
-        was met before the end. What an aborted run would have come to is not known, so it
-        is censored; trials that were cut by the loss of another one are not recorded."""
+        was met before the end. What a run that somebody aborted would have come to is not known, so
+        it is censored; trials that were cut by the loss of another one are not recorded."""
         success, lost = finished.status is Status.SUCCESS, self._tokens.lost(finished)
         for trial in [*self._open.values()]:
             gave_up = trial.number in lost and not self._aborted
@@ -385,7 +385,7 @@ class LearningSelector(FirstAlternative):
                 self._judge(now, trial, trial.goals > 0 or not self._goals)
             elif trial.met is None and gave_up:
                 self._judge(nan, trial, False)
-            if success or trial.completed or trial.back or trial.goals or trial.number in lost:
+            if success or trial.completed or trial.back or trial.goals or gave_up:
                 met = trial.back or (bool(trial.goals) and trial.number not in lost)
                 self._count(trial, success or trial.completed or met)
 

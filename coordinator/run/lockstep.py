@@ -133,7 +133,7 @@ class CoordinatorParty:
             waited = f"waited {self._patience:.0f} s of simulated time"
             why = "nothing can happen any more" if self._waiting.dead else waited
             missing = executor.engine.waiting_for(executor.state)
-            executor.stimulate(now, Abort(f"{why}, and no operator can act: {missing}"))
+            executor.stimulate(now, Abort(f"{why}, and no operator can act: {missing}", stuck=True))
         self._waiting.since = None
 
     def drain(self) -> Sequence[Envelope]:

@@ -18,7 +18,7 @@ from petrobot.coordinator.learning.estimate import Observation
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import Credit, RunEnd
+from petrobot.coordinator.learning.records import Credit, RunEnd, TrialEnd
 from petrobot.coordinator.learning.selectors import credited, verdicts_of_task
 from petrobot.coordinator.learning.session import LearningSession, LearningSetting
 from petrobot.coordinator.run.mission import Mission
@@ -218,6 +218,7 @@ def test_what_was_given_up_is_not_judged(task: Task) -> None:
         ended = sum(trial.completed for trial in log.trials)
         open_ += len(log.trials) - ended
         assert sum(c.primitive_task == "pick" for c in verdicts(selector)) == ended > 3
+        assert sum(isinstance(record, TrialEnd) for record in selector.records) == ended
     assert open_ > 3
 
 

@@ -14,8 +14,9 @@ from petrobot.coordinator.engine.instructions import Finished, Fired, Instructio
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import TrialEnd
+from petrobot.coordinator.learning.records import Credit, TrialEnd
 from petrobot.coordinator.learning.trial_tokens import TrialTokens
+from petrobot.coordinator.run import lockstep
 from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
@@ -95,10 +96,14 @@ class Watched:
 
 
 def played(
-    task: Task, runs: int, lines: dict[str, list[ScriptedRun]], *observers: Any
+    task: Task,
+    runs: int,
+    lines: dict[str, list[ScriptedRun]],
+    *observers: Any,
+    selector: LearningSelector | None = None,
 ) -> tuple[list[Trial], list[TrialEnd]]:
     """Return the trials as a campaign records them and as the learner does."""
-    selector = LearningSelector(Learning(task, "fixed"))
+    selector = selector or LearningSelector(Learning(task, "fixed"))
     setting = Setting(task, runs=runs, selector=selector)
     cell, party = lockstep_cell(directory_for(task), setting, scripts(task, lines))
     log = TrialLog(task, lambda record, values: record.seconds)
@@ -150,6 +155,20 @@ def test_the_trial_of_a_task_without_a_runs_place_is_lost_with_its_mission(end: 
     (trial,), ends = played(task, 1, {"load": [run(0.5, ActionStatus.ERROR)]})
     assert (trial.completed, trial.status, trial.cause) == (False, "error", "slipped")
     assert [(end.goal, end.success) for end in ends] == [(False, False)]
+
+
+def test_a_trial_that_waits_for_ever_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In lock step such a run is aborted, which is no operator's doing."""
+    monkeypatch.setattr(lockstep, "PATIENCE", 20.0)
+    text = PIPE.replace('out = ["weigh"] }', 'out = ["weigh"], event = "never" }')
+    task = loads(f'{text}[events]\nnever = {{ scope = "external" }}\n', "pipe.toml")
+    selector = LearningSelector(Learning(task, "fixed", credit="task"))
+    (trial,), ends = played(task, 1, {"load": [run(0.5)]}, selector=selector)
+    assert not trial.completed and [(end.goal, end.success) for end in ends] == [(False, False)]
+    judged = [
+        (r.primitive_task, r.outcome.status) for r in selector.records if isinstance(r, Credit)
+    ]
+    assert judged == [("load", Status.FAILURE)]
 
 
 @pytest.mark.parametrize("lines", [
