@@ -6,6 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUNS ?= 4
 MARKS ?= not proof and not browser
+WORKERS ?= 4
 TYPES := $(BIN)/mypy -p petrobot -p tests -p tools -p experiments
 ROUNDS ?= 20
 EXTRAS := test,oracle,opcua,ros2-dds,cluster,experiment,mcap,parquet,fast
@@ -50,7 +51,7 @@ test: style
 
 # What another interpreter has to pass, too: make suite PYTHON=python3.13 VENV=.venv-3.13
 suite: $(VENV)/.ready
-	$(BIN)/pytest -n 4 --dist worksteal -rs -m "$(MARKS)"
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -rs -m "$(MARKS)"
 
 # What `make test` skips, because it needs packages that petrobot does not.
 peers: $(VENV)/.ready
