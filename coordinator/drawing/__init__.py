@@ -178,7 +178,7 @@ def _frame(
         for n in scene.nodes.values()
         for sx, sy in ((-1, -1), (1, 1))
     ]
-    points += [w.point(i / 8) for w in paths for i in range(9)]
+    points += [point for path in paths for point in path.points]
     points += [p for w in words for p in ((w.box[0], w.box[1]), (w.box[2], w.box[3]))]
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
     left, top = round(min(xs) - _MARGIN), round(min(ys) - _MARGIN)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from math import hypot, inf
+from math import copysign, hypot, inf
 
 from petrobot.coordinator.drawing.layout import Point
 from petrobot.coordinator.drawing.scene import RADIUS, Arc, DrawnNode, Scene
@@ -160,9 +160,11 @@ def _path_through(
     straight. With `level` the path runs level for this distance on both sides of each point, so it
     does not cut a corner over a neighbour of the point.
     """
-    if level:
-        step = level if nodes[arc.target].at[0] > nodes[arc.source].at[0] else -level
-        points = [p for x, y in points for p in ((x - step, y), (x + step, y))]
+    if level:  # each second band of a wide layout runs to the left
+        around = [nodes[arc.source].at, *points, nodes[arc.target].at]
+        senses = [copysign(level, b[0] - a[0]) for a, b in zip(around, around[2:], strict=False)]
+        ways = zip(points, senses, strict=True)
+        points = [p for (x, y), step in ways for p in ((x - step, y), (x + step, y))]
     kept: list[Point] = []
     ahead = [*points[1:], nodes[arc.target].at]
     for point, after in zip(points, ahead, strict=True):

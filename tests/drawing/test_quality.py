@@ -3,6 +3,7 @@ development."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from petrobot.coordinator.drawing import render
 from petrobot.coordinator.drawing.layout import COLUMN, ROW, WIDEST, Point, lay_out_blocks
 from petrobot.coordinator.drawing.routing import ArcPath, Box, LabelBox, place_words, route
 from petrobot.coordinator.drawing.scene import (
@@ -158,12 +160,14 @@ def test_a_long_arc_back_runs_through_the_points_of_the_layout() -> None:
         )
 
 
-def chain(length: int) -> Task:
-    """Return a task of so many action places in a row, of which some hold one of two resources."""
+def chain(length: int, barred: str = "") -> Task:
+    """Return a task of so many action places in a row, of which some hold one of two resources. A
+    token in one of the places `barred` bars each fourth step."""
     places = [f'p{i} = {{ kind = "action", task = "w" }}' for i in range(length)]
     steps = []
     for i in range(length - 1):
         take, give = ', "arm"' * (i % 4 == 0), ', "arm"' * (i % 4 == 2)
+        take += f', "!{barred}"' * (bool(barred) and i % 4 == 3)
         steps.append(f't{i} = {{ in = ["p{i}:normal"{take}], out = ["p{i + 1}"{give}] }}')
     text = "\n".join(
         [
@@ -191,6 +195,24 @@ def test_a_long_net_is_folded(length: int, errors: bool) -> None:
     assert max(across) - min(across) <= WIDEST * COLUMN
     down = [node.at[1] for node in scene.nodes.values()]
     assert max(down) - min(down) <= 3 * WIDEST * COLUMN
+
+
+@pytest.mark.parametrize("length", [24, 40])
+def test_no_arc_of_a_folded_net_turns_back(length: int) -> None:
+    """Each second band runs to the left; an arc that goes on there has no barbs, and the picture
+    shows all of it."""
+    scene = scene_of_task(chain(length, "p1"), False, None, None)
+    paths = route(scene)
+    assert any(len(path.controls) > 2 for path in paths)
+    for path in paths:
+        steps = np.diff(np.array(path.points), axis=0)
+        steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+        assert (steps[1:] * steps[:-1]).sum(axis=1).min() > -0.5, path.arc
+    found = re.search(r'viewBox="(\S+) (\S+) (\S+) (\S+)"', render(scene))
+    assert found is not None
+    left, top, width, height = map(float, found.groups())
+    whole = left, top, left + width, top + height
+    assert all(inside(point, whole) for path in paths for point in path.points)
 
 
 SORTER = Path(__file__).parents[2] / "examples" / "sorter" / "sort.toml"
