@@ -37,6 +37,7 @@ TURN = 1 << 14
 """Most bytes that are read of a process in one turn of the loop. A process that writes without end
 would otherwise keep the node from all else: from heartbeats, devices and an emergency stop."""
 
+
 class ForkServer:
     """The process that forks the keepers of this process's children (`services/worker/keeper.py`).
     It has the working directory, environment and output of its start, so another one takes its
