@@ -3,6 +3,8 @@ the coordinator."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib
 import importlib.util
 import logging
@@ -12,6 +14,7 @@ import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -420,6 +423,28 @@ def module_name(name: str) -> str:
         return name
     _log.warning("%s is an old name; write petrobot.%s", name, name)
     return f"petrobot.{MOVED.get(name, name)}"
+
+
+def sources(directory: Directory, node: str) -> dict[str, tuple[str, str]]:
+    """Return path and digest of the source of each module that the file names for a node, as it is
+    found on this host now, without importing it. Modules of petrobot itself are left out, and so is
+    what the modules import."""
+    paths = [action.run for action in directory.actions.values() if action.node == node]
+    paths += [service.run for service in directory.services.values() if service.node == node]
+    paths += [device.driver for device in directory.devices.values() if device.node == node]
+    found = {}
+    for module in sorted({module_name(path.partition(":")[0]) for path in paths if path}):
+        spec, names, where = None, module.split("."), None
+        for count in range(1, len(names) + 1):
+            spec = PathFinder.find_spec(".".join(names[:count]), where)
+            where = spec.submodule_search_locations if spec is not None else None
+            if where is None:
+                break
+        if names[0] != "petrobot" and spec is not None and spec.name == module and spec.origin:
+            with contextlib.suppress(OSError):
+                text = Path(spec.origin).read_bytes()
+                found[module] = (spec.origin, hashlib.sha256(text).hexdigest()[:16])
+    return found
 
 
 def _at(fault: BaseException) -> str:
