@@ -20,7 +20,7 @@ schema = 1
 host = "127.0.0.1"
 port = {}
 [actions.greet]
-run = "greeting:greet"
+run = "parts.words.greeting:greet"
 task = "greet"
 node = "left"
 """
@@ -41,6 +41,8 @@ begun = { in = ["begin"], out = ["greet"] }
 ended = { in = ["greet:normal"], out = ["done"] }
 failed = { in = ["greet:error"], out = ["done"] }
 """
+MODULE = "parts/words/greeting.py"
+"""In packages without `__init__.py`."""
 CODE = """\
 from petrobot import Context, Result, success
 
@@ -51,8 +53,8 @@ def greet(ctx: Context) -> Result:
 
 
 def cell(folder: Path, port: int, word: str) -> Path:
-    folder.mkdir()
-    (folder / "greeting.py").write_text(CODE.format(word))
+    (folder / MODULE).parent.mkdir(parents=True)
+    (folder / MODULE).write_text(CODE.format(word))
     (folder / "task.toml").write_text(TASK)
     (folder / "services.toml").write_text(SERVICES.format(port))
     return folder
@@ -80,11 +82,13 @@ def test_a_node_with_other_code_is_named(tmp_path: Path) -> None:
     try:
         assert node.stdout is not None and "ready" in node.stdout.readline()
         assert "was started with another" not in run(one)
-        assert f"left was started with another greeting than {other}/greeting.py" in run(other)
-        (other / "greeting.py").write_text(CODE.format("one"))
+        assert f"left was started with another parts.words.greeting than {other / MODULE}" in run(
+            other
+        )
+        (other / MODULE).write_text(CODE.format("one"))
         assert "was started with another" not in run(other), "the same code in two places"
-        (one / "greeting.py").write_text(CODE.format("changed"))
-        assert f"left was started with another greeting than {one}/greeting.py" in run(one)
+        (one / MODULE).write_text(CODE.format("changed"))
+        assert f"left was started with another parts.words.greeting than {one / MODULE}" in run(one)
     finally:
         node.terminate()
         node.communicate(timeout=PATIENCE)
