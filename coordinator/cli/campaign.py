@@ -110,7 +110,7 @@ def _add_choices(parser: argparse.ArgumentParser) -> None:
 def _add_execution(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers",
-        type=whole(),
+        type=whole(most=1024),
         default=os.cpu_count() or 1,
         metavar="K",
         help="processes (%(default)s)",

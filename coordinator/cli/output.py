@@ -186,9 +186,9 @@ def give(session: RunSession, options: argparse.Namespace, timeline: Timeline | 
         print_result(result)
         for line in _remarks(session, result):
             print(line, file=sys.stderr)
-    session.keep_result()
-    if options.json:
+    if options.json:  # first: the run's folder may have become one that cannot be written
         write_json(options.json, result)
+    session.keep_result()
     if timeline is not None:
         from petrobot.coordinator.drawing import draw
         from petrobot.coordinator.studies.report import report_html

@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import json
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from petrobot.coordinator.cli.options import add_log_level_argument, recorded
 from petrobot.coordinator.cli.run import add_page_arguments, conduct, refuse_stopped
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.run.interfaces import Observer
@@ -104,15 +105,23 @@ def later_run(journal: Journal) -> str:
 
     own = journal.path
     others = [path for path in own.parent.parent.glob(f"*/{JOURNAL}") if path != own]
+    here = _addresses(journal.header)
     changed = {path: path.stat().st_mtime for path in (own, *others)}
     for path in sorted(others, key=lambda path: -changed[path]):
         if changed[path] <= changed[own]:
             break
-        with contextlib.suppress(JournalError, OSError):
+        with contextlib.suppress(JournalError, OSError, LookupError, ValueError):
             then = read_journal(path).header
-            if all(then[key] == journal.header[key] for key in ("mode", "services")):
+            if then["mode"] == journal.header["mode"] and _addresses(then) & here:
                 return path.parent.name
     return ""
+
+
+def _addresses(header: Mapping[str, Any]) -> set[tuple[str, int]]:
+    """Return where the nodes of a run listen. That, not the text of its services.toml, says whether
+    two runs use the same nodes: a comment or another cell's table changes nothing."""
+    nodes = tomllib.loads(header["services"]).get("nodes", {})
+    return {(str(node.get("host")), node.get("port")) for node in nodes.values()}
 
 
 def _result_of(path: Path) -> dict[str, Any] | None:

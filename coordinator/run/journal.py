@@ -89,6 +89,7 @@ class JournalWriter:
                     f"{path}: exists already; a journal is never overwritten"
                 ) from fault
             except OSError as fault:
+                _remove_empty(path.parent)
                 text = f"{path}: {fault.strerror}; give --journal a folder that can be written"
                 raise JournalError(text) from fault
             self._take(path)
@@ -100,8 +101,7 @@ class JournalWriter:
             except JournalError as fault:
                 os.close(self._file)
                 path.unlink(missing_ok=True)  # the run has not begun: leave nothing behind
-                with contextlib.suppress(OSError):
-                    path.parent.rmdir()  # if there is nothing else in it
+                _remove_empty(path.parent)
                 raise JournalError(
                     f"{fault}; give --journal a folder that can be written"
                 ) from fault
@@ -209,6 +209,11 @@ class JournalWriter:
             self.sync()
         finally:
             os.close(self._file)
+
+
+def _remove_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # there is something else in it
+        folder.rmdir()
 
 
 def read_journal(path: Path) -> Journal:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 import math
 import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from shlex import quote
 from typing import Final
 
@@ -16,7 +18,7 @@ from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import KEY_CODES, Client
 from petrobot.services.comm.calls.peers import LEASED, OVERTAKEN
-from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import Directory, sources
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
     LEASE,
@@ -27,6 +29,8 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.tls.credentials import Credentials, credentials
 from petrobot.services.host.emergency_latch import uptime
+
+_log = logging.getLogger(__name__)
 
 PERIOD: Final = 0.05
 """Time between two checks (s)."""
@@ -125,9 +129,9 @@ class RealtimeMission:
         self._leased: list[str] = []
         """Devices that this run has, in the order in which it took them."""
         self._answers: dict[str, asyncio.Future[Answer]] = {}
-        """Answers to come to the requests for devices, by the command's id."""
+        """Answers to come to this run's own commands, by the command's id."""
         self._asked = itertools.count()
-        """Numbers of these requests."""
+        """Numbers of these commands."""
         self._missed: list[str] | None = []
         """Nodes that cleared an emergency stop after that; None once all nodes are connected: from
         then on the callers count the stops."""
@@ -196,13 +200,29 @@ class RealtimeMission:
             )
 
     def _take_device(self, device: str) -> asyncio.Future[Answer]:
-        client = self.clients[self._directory.where(device)]
+        return self._ask(self._directory.where(device), LEASE, device)
+
+    def _ask(self, node: str, verb: str, target: str = "") -> asyncio.Future[Answer]:
+        client = self.clients[node]
         hello = client.caller.hello
-        id_ = f"{hello.name}/{hello.epoch}/{LEASE}/{next(self._asked)}"
+        id_ = f"{hello.name}/{hello.epoch}/{verb}/{next(self._asked)}"
         answer = self._answers[id_] = self._loop.create_future()
-        client.caller.command(self.now(), Command(id_, LEASE, device))
+        client.caller.command(self.now(), Command(id_, verb, target))
         client.flush()
         return answer
+
+    def _compare_code(self, node: str, answer: asyncio.Future[Answer]) -> None:
+        """Say which modules a node was started with that differ from those here. A node imports
+        them once, and two folders may hold the same services.toml."""
+        here = sources(self._directory, node)
+        found = {} if answer.cancelled() else answer.result().data.get("code", {})
+        for module, (path, digest) in here.items():
+            if module in found and found[module] != digest:
+                _log.warning(
+                    "node %s was started with another %s than %s is now: it runs that other code; "
+                    "restart it, from this folder, to run this one",
+                    *(node, module, path),
+                )
 
     def _look_if_overtaken(self, answer: asyncio.Future[Answer]) -> None:
         """End the run if it has lost a device: its next action would not know where it stands."""
@@ -317,6 +337,9 @@ class RealtimeMission:
                     since = split_boot(notice.boot)[2]
                     if self._missed is not None and uptime() - self._ordered > since + TRANSIT:
                         self._missed.append(node)
+                    if not self._closed:
+                        status = self._ask(node, "status")
+                        status.add_done_callback(partial(self._compare_code, node))
                     # A restarted node does not know of the devices that the run has. It must not
                     # ask for those that it only waits for: they come in the order of the file.
                     for device in self._leased:

@@ -32,6 +32,7 @@ FORK_LIMIT = 20.0
 PIPE_LIMIT = 0.5
 """Time after the end of its pipe at which a process is killed (s): the node can reach it no
 more."""
+CUT_OFF = "its code closed files that it had not opened, among them its pipe; it was killed"
 TURN = 1 << 14
 """Most bytes that are read of a process in one turn of the loop. A process that writes without end
 would otherwise keep the node from all else: from heartbeats, devices and an emergency stop."""
@@ -257,7 +258,7 @@ class Child:
         """Return how it ended, in words."""
         code = self.code
         if code is None or (self._killed and code == -signal.SIGKILL):
-            return self._killed or "it closed its pipe"
+            return self._killed or CUT_OFF
         # Otherwise it had ended by itself before it could be killed.
         if code >= 0:
             return f"it exited with code {code}"
@@ -296,7 +297,7 @@ class Child:
         if self.pipe.ended and not self._let_go:
             self._close_pipe()
             self._forked.set()
-            self._limit(PIPE_LIMIT, lambda: self.kill("it closed its pipe, and was killed"))
+            self._limit(PIPE_LIMIT, lambda: self.kill(CUT_OFF))
 
     async def _wait_for_end(self) -> None:
         await self._forked.wait()

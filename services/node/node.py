@@ -214,6 +214,8 @@ class Node:
         self.directory = directory
         self.name = name
         self.boot = boot
+        self.code: Mapping[str, str] = {}
+        """Digest of the source of each module that it was started with (`sources`)."""
         services = [s for s in directory.services.values() if s.node == name and s.run]
         waiting = {
             s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))
@@ -513,6 +515,7 @@ class Node:
                 if command.verb == "status":
                     data["emergency"] = list(self.stopped_in_emergency())
                     data["dry_run"] = self.directory.dry_run
+                    data["code"] = self.code
                     data["events_dropped"] = dict(self.callee.events.dropped)
                 self.callee.answer(now, id_, held and not command.missing, data)
 

@@ -18,7 +18,7 @@ from petrobot.services.comm.calls.caller import Notice
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.link import Alarm, clock_of
 from petrobot.services.comm.calls.server import Server
-from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.location_file import Directory, DirectoryError, sources
 from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
 from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.comm.protocol.security import all_keys, require_key
@@ -77,6 +77,7 @@ class NodeShell:
             stream_address=self._stream_address,
             latch=self.latch,
         )
+        self.node.code = {m: digest for m, (_, digest) in sources(directory, name).items()}
         key, tls = self._credentials.key, self._credentials.server()
         self.server = Server(self.node.callee, on_orders=self._obey, key=key, tls=tls)
         self._client_tls = self._credentials.client()

@@ -63,24 +63,39 @@ def _become_copy() -> None:
         end.close()
 
 
-class Pipe:
-    """One end. `post` sends as much as fits; `read` returns whole items. `closed` is set when the
-    other end is gone; what that one sent before can still be read until `ended`."""
+class _End:
+    """One end of a socket pair."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
         _ENDS.add(end)
         self.socket = end
         self.closed = False
+        """Whether it is of no more use."""
+        self.lost = False
+        """Whether that is so because user code has closed this end, or put another file into its
+        place."""
+
+    def fileno(self) -> int:
+        """For selectors."""
+        return self.socket.fileno()
+
+    def _fail(self, fault: OSError) -> None:
+        self.closed = True
+        self.lost |= fault.errno not in (errno.EPIPE, errno.ECONNRESET)
+
+
+class Pipe(_End):
+    """One end. `post` sends as much as fits; `read` returns whole items. `closed` is set when the
+    other end is gone; what that one sent before can still be read until `ended`."""
+
+    def __init__(self, end: socket.socket) -> None:
+        super().__init__(end)
         self.ended = False
         """Whether it is closed and everything that came has been read."""
         self._unsent = bytearray()
         self._packer = msgpack.Packer()
         self._unpacker = msgpack.Unpacker(max_buffer_size=LARGEST)
-
-    def fileno(self) -> int:
-        """For selectors."""
-        return self.socket.fileno()
 
     @property
     def unsent(self) -> bool:
@@ -128,8 +143,8 @@ class Pipe:
                     del self._unsent[: self.socket.send(self._unsent)]
                 except BlockingIOError:
                     raise
-                except OSError:  # the other end is gone, or user code has closed this one
-                    self.closed = True
+                except OSError as fault:
+                    self._fail(fault)
                     self._unsent.clear()
 
     def read(self, most: int | None = None) -> list[Item]:
@@ -143,7 +158,8 @@ class Pipe:
                 count = self.socket.recv_into(_BUFFER, most or CHUNK)
             except BlockingIOError:
                 break
-            except OSError:
+            except OSError as fault:
+                self._fail(fault)
                 count = 0
             if not count:
                 self.closed = self.ended = True
@@ -220,19 +236,9 @@ def permit_counter() -> int:
     return os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
 
 
-class NewestLink:
+class NewestLink(_End):
     """One end of the link between actions and their driver: commands one way, states the other, as
     datagrams of a SOCK_SEQPACKET pair. Only the newest state counts."""
-
-    def __init__(self, end: socket.socket) -> None:
-        end.setblocking(False)
-        _ENDS.add(end)
-        self.socket = end
-        self.closed = False
-
-    def fileno(self) -> int:
-        """For selectors."""
-        return self.socket.fileno()
 
     def send(self, items: list[Any]) -> bool:
         """Send one datagram. Return False if the other end does not read or is closed. Raises
@@ -247,7 +253,7 @@ class NewestLink:
                 raise ValueError(
                     f"{len(data)} bytes do not fit into one datagram; send less"
                 ) from fault
-            self.closed = True
+            self._fail(fault)
             return False
         return True
 
@@ -262,16 +268,18 @@ class NewestLink:
 
     def _datagrams(self) -> list[bytes]:
         datagrams = []
-        with contextlib.suppress(BlockingIOError):
-            while not self.closed:
-                try:
-                    data = self.socket.recv(CHUNK)
-                except ConnectionResetError:
-                    data = b""
-                if not data:
-                    self.closed = True
-                    break
-                datagrams.append(data)
+        while not self.closed:
+            try:
+                data = self.socket.recv(CHUNK)
+            except BlockingIOError:
+                break
+            except OSError as fault:
+                self._fail(fault)
+                data = b""
+            if not data:
+                self.closed = True
+                break
+            datagrams.append(data)
         return datagrams
 
     def close(self) -> None:

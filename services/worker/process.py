@@ -77,6 +77,8 @@ the remaining memory. They are sent over DESCRIPTORS: user code may end its proc
 code, and the pipe may be full of what there is no memory to send."""
 CHANGED = 92
 """Exit code: a run has changed its process for good."""
+CUT_OFF_LIMIT = 5.0
+"""Time in which the node must kill a process whose pipe user code has closed (s)."""
 
 
 _log = logging.getLogger(__name__)
@@ -377,7 +379,7 @@ class Worker:
             if self._used and not self._place.runs:
                 os.sched_yield()  # first let the node read the report
                 self._restore()  # now, so that the next call need not wait for it
-            if self._changed and not self._node.unsent:
+            if self._changed and not self._node.unsent and not self._node.closed:
                 os._exit(CHANGED)
         self._place.close(monotonic())
         self._outlets.close()
@@ -394,7 +396,7 @@ class Worker:
         self._report(now)
 
     def _may_begin(self) -> bool:
-        return not (self._spent or self._place.runs)
+        return not (self._spent or self._changed or self._place.runs)
 
     def _begin(self, now: float, call: Call) -> None:
         """Begin a call, unless the node has taken it back, or this process cannot be made as it was
@@ -403,16 +405,18 @@ class Worker:
         if self._changed:
             self._calls.appendleft(call)
         elif self._permits.take():
-            self._used = self._one_by_one
+            self._used = True
             self._place.take(now, call)
         else:
             self._node.post([DROPPED, [call.id]])
 
     def _restore(self) -> None:
-        """Undo what the last run has changed in this process."""
-        if self._used and (why := self._surroundings.restored()):
+        """Undo what the last run has changed in this process, unless another run is active."""
+        if self._place.runs or not self._used:
+            return
+        if (why := self._surroundings.restored()) and not self._node.closed:
             _log.warning("a run has changed this process for good: %s", why)
-            self._spent = self._changed = True
+            self._changed = True
         self._used = False
 
     def _give_back(self) -> None:
@@ -575,13 +579,24 @@ def main(passed: Sequence[int]) -> None:
     try:
         serve(node, descriptors, link, permits)
     except (LinkLostError, MemoryError) as fault:
+        _await_kill(node, link)
         with contextlib.suppress(OSError):  # user code has closed it
             descriptors.send(LINK_LOST if isinstance(fault, LinkLostError) else NO_MEMORY)
         os._exit(1)
     finally:
+        _await_kill(node, link)
         # At its end Python waits for every thread that is not a daemon, and some never end.
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, LAST_THREADS)
+
+
+def _await_kill(node: Pipe, link: NewestLink | None) -> None:
+    """Wait until the node kills this process, if user code has closed its files. To exit would
+    blame the user's code for an exit; so the node says what it saw, the end of the pipe."""
+    if node.lost or (link is not None and link.lost):
+        with contextlib.suppress(OSError):
+            node.close()
+        time.sleep(CUT_OFF_LIMIT)
 
 
 def _take_signals() -> None:

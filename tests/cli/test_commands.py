@@ -179,6 +179,10 @@ COMPARE = ["forecast", "--compare", "forecast.json", "campaigns/new"]
             "--runs: abc is not a whole number of at least 1",
         ),
         (
+            ["campaign", "catch_ball", "--workers", "1000000000"],
+            "--workers: 1000000000 is more than the largest number, 1024",
+        ),
+        (
             ["campaign", "catch_ball", "--target", "2"],
             "--target: 2 is not a number of more than 0 and at most 1",
         ),

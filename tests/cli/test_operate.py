@@ -72,13 +72,18 @@ async def test_a_second_run_is_refused_while_the_first_has_its_device(petrobot: 
     assert petrobot.arm.moving
 
 
+NODE = '[nodes.a]\nhost = "127.0.0.1"\nport = 7301\n'
+
+
 @pytest.mark.parametrize(
     ("mode", "services", "age", "told"),
     [
-        ("realtime", "cell", 0.0, "other"),
-        ("realtime", "cell", 9.0, ""),
-        ("lockstep", "cell", 0.0, ""),
-        ("realtime", "another cell", 0.0, ""),
+        ("realtime", NODE, 0.0, "other"),
+        ("realtime", NODE, 9.0, ""),
+        ("lockstep", NODE, 0.0, ""),
+        ("realtime", f"# a note\n\n{NODE}[nodes.more]\nport = 2", 0.0, "other"),
+        ("realtime", NODE.replace("7301", "7302"), 0.0, ""),
+        ("realtime", "no TOML", 0.0, ""),
     ],
 )
 def test_a_resume_names_the_run_that_has_used_the_devices_since(
@@ -86,7 +91,7 @@ def test_a_resume_names_the_run_that_has_used_the_devices_since(
 ) -> None:
     """`age`: how much older than the interrupted run the other one's last record is (s)."""
     own, other = (tmp_path / name / JOURNAL for name in ("own", "other"))
-    JournalWriter(own, {"mode": "realtime", "services": "cell"}).close()
+    JournalWriter(own, {"mode": "realtime", "services": NODE}).close()
     JournalWriter(other, {"mode": mode, "services": services}).close()
     os.utime(own, (1_000.0, 1_000.0))
     os.utime(other, (1_005.0 - age, 1_005.0 - age))

@@ -49,9 +49,13 @@ block = {{ run = "toy_cell.actions:block", task = "sum", node = "left" }}
 chatter = {{ run = "toy_cell.actions:chatter", task = "sum", node = "left" }}
 write_down = {{ run = "toy_cell.actions:write_down", task = "sum", node = "left" }}
 change = {{ run = "toy_cell.actions:change", task = "sum", node = "left" }}
+change_eye = {{ run = "toy_cell.actions:change", task = "see", device = "eye" }}
+change_slide = {{ run = "toy_cell.actions:change", task = "move", device = "slide" }}
 """
 )
 WAYS = ("fork", "daemon", "program", "program with sockets")
+OF_NO_USE = ("closed output", "closed files", "memory", "files", "priority")
+"""Changes after which a process may be of no more use."""
 PLACES = ("leave_behind", "leave_behind_eye", "leave_behind_slide")
 
 
@@ -151,13 +155,19 @@ async def test_an_action_that_closes_its_pipe_ends_only_its_run(
     operator: Operator, tmp_path: Path
 ) -> None:
     for then in ("block", "return"):
-        mark = tmp_path / then
-        began = time.monotonic()
-        end = await operator.call("leave_behind", 30.0, how="no pipe", mark=str(mark), then=then)
-        assert (end.status, end.cause) == ("error", "worker_died"), end
-        assert time.monotonic() - began < LATE
-        await gone(operator, int(mark.read_text()))
+        for service in PLACES:
+            innocent = asyncio.ensure_future(operator.call("nap", 20.0, seconds=0.5))
+            mark = tmp_path / f"{service} {then}"
+            began = time.monotonic()
+            end = await operator.call(service, 30.0, how="no pipe", mark=str(mark), then=then)
+            assert (end.status, end.cause) == ("error", "worker_died"), end
+            assert "closed" in end.text and "pipe" in end.text and "exited" not in end.text
+            assert time.monotonic() - began < LATE
+            assert (await innocent).status == "success"
+            await gone(operator, int(mark.read_text()))
     assert (await operator.call("add", a=1)).values == {"sum": 2}
+    assert (await operator.call("eye_pid")).status == "success"
+    assert (await operator.call("go", to=0.0)).status == "success"
 
 
 async def test_a_copy_that_returns_from_the_action_does_nothing_more(
@@ -419,5 +429,19 @@ async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
         assert end.values["found"] == before
         again += end.values["pid"] == changed.values.get("pid")
         await asyncio.sleep(0.05)
-    of_no_use = ("closed output", "closed files", "memory", "files", "priority")
-    assert again or what in of_no_use, "after these a process may be of no more use"
+    assert again or what in OF_NO_USE
+
+
+@pytest.mark.parametrize("service", ["change_eye", "change_slide"])
+@pytest.mark.parametrize("what", ["folder", "mask", "environment", "path", "built-in", "priority"])
+async def test_what_a_run_of_a_device_changes_does_not_reach_the_next(
+    operator: Operator, service: str, what: str
+) -> None:
+    before = (await operator.call(service)).values
+    changed = await operator.call(service, what=what)
+    assert changed.status == "success"
+    for _ in range(2):
+        end = await operator.call(service)
+        assert end.status == "success", end
+        assert end.values["found"] == before["found"]
+        assert end.values["pid"] == before["pid"] or what in OF_NO_USE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -9,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError, journal_of, retain
-from petrobot.coordinator.run.journal import JournalWriter
+from petrobot.coordinator.run.journal import JournalError, JournalWriter
 
 SERVICES = """
 schema = 1
@@ -108,3 +110,32 @@ def test_resume_of_an_ended_run_says_how_it_ended(
     (run / JOURNAL).write_bytes(golden.read_bytes()[:100] + b"damaged" + golden.read_bytes()[107:])
     assert main(["resume", str(run)]) == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_the_end_of_a_run_does_not_depend_on_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk may have become read-only meanwhile: the mission's result must still be told."""
+
+    def unlink(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with published(tmp_path, RunAddress("run", "http://127.0.0.1:1", "token", os.getpid())):
+        monkeypatch.setattr(Path, "unlink", unlink)
+
+
+def test_a_run_that_cannot_have_a_journal_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    opened = os.open
+
+    def open_file(path: Path, flags: int, *mode: int) -> int:
+        return full() if flags & os.O_EXCL else opened(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", open_file)
+    with pytest.raises(JournalError, match="No space left on device"):
+        JournalWriter(tmp_path / "run" / JOURNAL, {})
+    assert not list(tmp_path.iterdir())

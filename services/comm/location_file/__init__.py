@@ -3,6 +3,8 @@ the coordinator."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib
 import importlib.util
 import logging
@@ -420,6 +422,25 @@ def module_name(name: str) -> str:
         return name
     _log.warning("%s is an old name; write petrobot.%s", name, name)
     return f"petrobot.{MOVED.get(name, name)}"
+
+
+def sources(directory: Directory, node: str) -> dict[str, tuple[str, str]]:
+    """Return path and digest of the source of each module that the file names for a node, as it is
+    found on this host now, without importing it. Modules of petrobot itself are left out, and so is
+    what the modules import."""
+    paths = [action.run for action in directory.actions.values() if action.node == node]
+    paths += [service.run for service in directory.services.values() if service.node == node]
+    paths += [device.driver for device in directory.devices.values() if device.node == node]
+    found = {}
+    for module in sorted({module_name(path.partition(":")[0]) for path in paths if path}):
+        # By hand: Python's own finders import the packages above a module.
+        places = [Path(folder, *module.split(".")) for folder in sys.path]
+        files = (file for place in places for file in (place / "__init__.py", Path(f"{place}.py")))
+        with contextlib.suppress(StopIteration, OSError):
+            file = next(file for file in files if file.is_file())
+            if not module.startswith("petrobot."):
+                found[module] = (str(file), hashlib.sha256(file.read_bytes()).hexdigest()[:16])
+    return found
 
 
 def _at(fault: BaseException) -> str:
