@@ -5,7 +5,7 @@ Clocks and random generators come from the caller.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, isfinite, sqrt
 from pathlib import Path
@@ -172,6 +172,7 @@ def analyse_command(
         return CommandResult(FAULT, told, {"error": told})
     except OUT_OF_MEMORY:
         return full
+    notes = (*notes, *_raised_by(analyses[-1]))
     said += [wrapped(f"note: {note}", 4) for note in notes]
     return CommandResult(
         OK if analyses[-1].ok else FAULT,
@@ -179,6 +180,21 @@ def analyse_command(
         data | {"notes": [*data["notes"], *notes]},
         analysis=analyses[-1],
     )
+
+
+RAISED = {"limit of ": "--states", "memory limit": "--memory", "time limit": "--seconds"}
+"""The option that raises a limit, by the first words of the reason that names it."""
+
+
+def _raised_by(found: Analysis) -> Iterator[str]:
+    """Yield a note that names the options that raise the limits which ended the searches; none
+    where another note names them."""
+    reasons = [found.qualitative.space.reason]
+    reasons += [found.progress.x.reason] if found.progress else []
+    options = [o for words, o in RAISED.items() if any(r.startswith(words) for r in reasons)]
+    told = " ".join(found.told)
+    if options := [option for option in options if option not in told]:
+        yield f"to search further give more {' and '.join(options)}"
 
 
 def _deadlines(limits: SearchLimits, analyses: int) -> list[tuple[float | None, float | None]]:

@@ -799,6 +799,12 @@ def _doubts(
     return doubts, next(iter(exact), None)
 
 
+def _apart(one: float, other: float) -> tuple[str, str]:
+    """Return two numbers with equally many digits: at least six, and enough to tell them apart."""
+    texts = ((f"{one:#.{n}g}", f"{other:#.{n}g}") for n in range(6, 18))
+    return next((pair for pair in texts if pair[0] != pair[1]), (f"{one:g}", f"{other:g}"))
+
+
 def _as_chain(
     found: Forecast,
     measured: Measured | None,
@@ -819,7 +825,7 @@ def _as_chain(
         found = forecast(same, limits=limits)
     exact = chain.figures
     off = [
-        f"{name} {value:.6g} here, {exact[name]:.6g} there"
+        "{} {} here, {} there".format(name, *_apart(value, exact[name]))
         for name, value in found.figures.items()
         if abs(value - exact[name]) > AGREE * max(abs(value), abs(exact[name]))
     ]

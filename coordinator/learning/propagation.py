@@ -31,7 +31,7 @@ from petrobot.coordinator.learning.objective import (
     objective,
 )
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
-from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, Place, Status, Task
 
 # --- competing risks ---
 
@@ -146,9 +146,12 @@ def measured_from(
             runs[key], preempted[key] = _ends(tally, takers, extra)
             errors = causes[place.task, action][Status.ERROR]
             if at_deadline := added(n for (cause, _), n in errors.items() if cause == LATE[0]):
-                deadline = min(task.primitive_task_of(place.name).deadline, place.timeout or inf)
-                late[key] = Estimate(at_deadline / added(errors.values()), deadline + extra, 0.0)
+                share = at_deadline / added(errors.values())
+                late[key] = Estimate(share, _limit(task, place) + extra, 0.0)
             sources[key] = _source(tally, (kinds or {}).get((place.task, action), {}))
+            if len(limits := _limits(task, place.task)) > 1:
+                ends = " and ".join(f"{s:g} s" for s in sorted(limits))
+                sources[key] += f", together at places that end runs after {ends}"
             if not takers:
                 del preempted[key]
     return Measured(
@@ -162,6 +165,18 @@ def measured_from(
         late=late,
         mixed=frozenset(mixed),
     )
+
+
+def _limit(task: Task, place: Place) -> float:
+    """Return after how long a run in a place is ended (s)."""
+    timeout = inf if place.timeout is None else place.timeout
+    return min(task.primitive_task_of(place.name).deadline, timeout)
+
+
+def _limits(task: Task, primitive: str) -> set[float]:
+    """Return after how long runs of a primitive task are ended (s), at its different places. Their
+    runs are counted together, so each place gets the mixture."""
+    return {_limit(task, p) for p in task.flat.places.values() if p.task == primitive}
 
 
 def _causes(tally: Tally) -> tuple[dict[Status, dict[Ending, float]], bool]:

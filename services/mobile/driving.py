@@ -241,7 +241,9 @@ async def _follow(
     as the driver reports.
 
     `recovery` is the run that found the line, if it is to be judged: a line that is followed to an
-    end that was announced belongs to the track, one that ceases does not.
+    end that was announced belongs to the track, one that ceases does not. The value `recovery` is
+    the run that is still to be judged, empty after its verdict: a later stretch gives no second
+    one.
     """
     drive = _Drive(ctx, law, speed, timeout)
     begun, way = ctx.now, ctx.device.state["way"]
@@ -277,20 +279,23 @@ async def _follow(
         raise
     if recovery and result.status is Status.SUCCESS:
         ctx.verdict(recovery, Status.SUCCESS)
+        recovery = ""
     elif recovery and result.cause in ("unannounced_end", "no_line"):
         ctx.verdict(recovery, Status.FAILURE, "not_the_track", result.text)
+        recovery = ""
     if result.cause:
         await drive.rest()
-    return result
+    return replace(result, values={**result.values, "recovery": recovery})
 
 
 def _found(ctx: Context, result: Result, judged: bool) -> Result:
     """Return the result of a recovery; if it is to be judged, a found line is provisional, and
-    `run` is what following it judges."""
+    `run` is what following it judges. It is empty where nothing was found: that is final."""
     if not judged or result.status is Status.ERROR:
         return result
-    result = replace(result, values={**result.values, "run": ctx.run})
-    return provisional(result) if result.status is Status.SUCCESS else result
+    found = result.status is Status.SUCCESS
+    result = replace(result, values={**result.values, "run": ctx.run if found else ""})
+    return provisional(result) if found else result
 
 
 async def _along(drive: _Drive, plan: paths.Points) -> Result:

@@ -267,7 +267,34 @@ def test_a_search_without_limits_of_its_own_keeps_the_memory_of_the_analysis() -
     assert explore(kanban(3), engine="numpy").complete
     with until(1.0, lambda: 0.0, memory=1_000_000):
         space = explore(kanban(3), engine="numpy")
-    assert not space.complete and space.reason == "memory limit of 1000000 bytes"
+    assert not space.complete and space.reason.startswith("memory limit of 0.9537 MiB, ")
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason", "option"),
+    [
+        (SearchLimits(states=50), "limit of 50 states", "--states"),
+        (
+            SearchLimits(seconds=2.0, clock=Steps()),
+            "time limit of 2 s, of which searches get a part",
+            "--seconds",
+        ),
+        (
+            SearchLimits(memory=100),
+            "memory limit of 9.537e-05 MiB, of which searches get a part",
+            "--memory",
+        ),
+    ],
+    ids=["states", "time", "memory"],
+)
+def test_the_limit_that_ended_a_search_is_named_with_its_option(
+    limits: SearchLimits, reason: str, option: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "net.pnml"
+    path.write_text(write_pnml(NetFile(kanban(3))), encoding="utf-8")
+    found = analyse_command(path, limits=limits)
+    assert found.data["reason"] == reason
+    assert f"to search further give more {option}" in found.data["notes"]
 
 
 def test_all_parts_of_an_analysis_share_its_time(tmp_path: Path) -> None:

@@ -359,3 +359,18 @@ def test_the_distribution_ends_where_rounding_begins() -> None:
     assert whole.quantile(0.5) < found.done.mean < whole.quantile(0.99)
     mean = float(np.sum(whole.probability - whole.absorbed) / whole.rate / whole.probability)
     assert mean == pytest.approx(found.done.mean, rel=1e-6)
+
+
+def test_a_stationary_vector_that_differs_within_blocks_of_neighbours_is_found() -> None:
+    """Two rings, one of the even and one of the odd numbers, that hardly exchange anything: steps
+    over blocks of consecutive numbers undid what the sweeps had gained, for ever."""
+    n = 806
+    rows = np.concatenate([np.tile(np.arange(n), 2), [0, 1]])
+    ring = np.concatenate([(np.arange(n) + 2) % n, (np.arange(n) - 2) % n])
+    columns = np.concatenate([ring, [1, 0]])
+    value = np.concatenate([np.ones(2 * n), [1e-4, 3e-4]])
+    value /= np.bincount(rows, value)[rows]
+    found = stationary(n, rows, columns, value)
+    flow = np.bincount(columns, found[rows] * value, n)
+    assert np.abs(flow - found).max() < 1e-12 * found.max()
+    assert found[::2].sum() / found[1::2].sum() == pytest.approx(3.0, rel=1e-3)

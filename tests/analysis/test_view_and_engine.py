@@ -23,7 +23,7 @@ from petrobot.coordinator.analysis.execution.chain import (
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, execute
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.space import SearchLimits
-from petrobot.coordinator.analysis.report import analyse
+from petrobot.coordinator.analysis.report import _apart, analyse
 from petrobot.coordinator.analysis.time.measured import Measured, Numbers, OwnEnd, cut
 from petrobot.coordinator.analysis.time.simulate import goal_by_marking, simulate
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
@@ -672,6 +672,12 @@ def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:
     assert "mean time (s) " in doubt and "conflicts that neither priority nor weight" in doubt
     assert "doubtful: " in found.text()
     assert found.to_json(structure=False)["forecast"]["doubts"] == list(found.doubts)
+
+
+def test_figures_that_differ_are_printed_with_digits_that_differ() -> None:
+    assert _apart(16.877, 16.8765) == ("16.8770", "16.8765")
+    assert _apart(1.0, 1.0 - 2e-6) == ("1.00000", "0.999998")
+    assert _apart(2.0, 2.0 - 4e-6) == ("2.000000", "1.999996")
 
 
 EXACT = {

@@ -425,6 +425,22 @@ def test_ends_at_the_deadline_are_known_by_their_cause() -> None:
     assert not measured.expected and measured.mixed == {("a", "do_a")}
 
 
+def test_places_that_end_runs_at_different_times_are_said_to_be_counted_together() -> None:
+    """Runs are counted by primitive task, so each place has the mixture of all."""
+    out = Tally().adding(Observation(Status.SUCCESS, 1.0), "x")
+    task = series(1)
+    (place,) = [p for p in task.places.values() if p.task == "a"]
+    other = replace(place, name="other", task="a", timeout=0.5)
+    both = replace(task, places={**task.places, "other": other})
+    estimates = Estimates({TallyKey("a", "do_a"): out})
+    told = [set(measured_from(t, estimates).sources.values()) for t in (task, both)]
+    assert told[0] == {"measured in 1 run"}
+    deadline = task.primitive_tasks["a"].deadline
+    assert told[1] == {
+        f"measured in 1 run, together at places that end runs after 0.5 s and {deadline:g} s"
+    }
+
+
 def test_an_aborted_run_is_censored() -> None:
     """Runs that the operator aborted are censored: shares follow from competing risks over the
     sample."""

@@ -48,6 +48,9 @@ JUDGED = 6
 """Peak memory of a search and all verdicts on its space, relative to what the engine held at its
 end (5.2 for Kanban-5: the strong components, reversed edges and columns of tokens)."""
 
+SHARED = "of which searches get a part"
+"""Why a search ends before the whole limit is used up."""
+
 
 @dataclass(frozen=True, slots=True)
 class SearchLimits:
@@ -263,7 +266,7 @@ def _run(
             if cap is not None and engine.states >= cap:
                 break
             if limits.memory is not None and engine.nbytes * JUDGED > limits.memory:
-                return f"memory limit of {limits.memory} bytes"
+                return f"memory limit of {limits.memory / 2**20:.4g} MiB, {SHARED}"
             if late := _late(limits, started):
                 return late
     except TooManyTokens as grown:
@@ -281,8 +284,10 @@ def _late(limits: SearchLimits, started: float) -> str:
     """Return the reason for stopping if the time is used up, else an empty string."""
     if limits.seconds is None or limits.clock is None:
         return "time limit" if overtime() else ""
-    due = started + limits.seconds if limits.due is None else limits.due
-    return f"time limit of {limits.seconds:g} s" if limits.clock() > due else ""
+    told = f"time limit of {limits.seconds:g} s"
+    if limits.due is None:
+        return told if limits.clock() > started + limits.seconds else ""
+    return f"{told}, {SHARED}" if limits.clock() > limits.due else ""
 
 
 def _space(found: Explored, reason: str, engine: str) -> Space:

@@ -227,7 +227,7 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
     factor, lower = triangular(n, n - 1 - columns, n - 1 - rows, value)
     coarse, x = Coarse(n, n - 1 - rows, n - 1 - columns), np.full(n, 1.0 / n)
     mixing = Mixing()
-    moved = inf
+    helps, last, moved = True, inf, inf
     for k in range(SWEEPS):
         keep_time("stationary distribution")
         swept = factor.solve(lower @ x)
@@ -236,7 +236,10 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
         moved = max(float(change.max()), -float(change.min()))
         if moved <= TOLERANCE * float(swept.max()):
             return np.asarray(swept[::-1].copy())
-        if coarse.is_due(k):
+        if helps and coarse.is_due(k):
+            # Where x differs much within the blocks, a coarse step undoes what the sweeps gained.
+            helps, last = moved < HELPS * last, moved
+        if helps and coarse.is_due(k):
             x = swept * coarse.scale(value, swept)
             x /= x.sum()
             mixing = Mixing()
@@ -245,6 +248,11 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
         # A mixture may have negative entries, of which aggregation and sums make no sense.
         x = mixed if float(mixed.min()) > 0 else swept
     raise NotConverged(f"the stationary vector still moved by {moved:.2e} after {SWEEPS} sweeps")
+
+
+HELPS = 0.9
+"""What is left of the change from one coarse step to the next, at most: where more is left, it
+hardly converges, and sweeps alone are better."""
 
 
 class Mixing:

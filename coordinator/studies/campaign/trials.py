@@ -8,7 +8,7 @@ contain several trials. A task without a runs place has one trial per mission ru
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from petrobot.coordinator.engine import State
@@ -293,7 +293,9 @@ class TrialLog:
         entry.judged = not record.deferred
         entry.executed, entry.seconds = record.executed.value, round(record.seconds, DIGITS)
         entry.values = _numbers(values)
-        cost = self._cost_of(record, values)
+        # Of a preempted run, what comes after the firing that took it is no cost of the task.
+        taken = record.cancelled and bool(entry.taken)
+        cost = self._cost_of(replace(record, seconds=entry.took) if taken else record, values)
         entry.cost = None if cost is None else round(cost, DIGITS)
         self._ends.setdefault(trial.k, []).append(entry)
         if _RANK[entry.status] > _RANK[trial.status]:

@@ -30,6 +30,7 @@ from petrobot.coordinator.studies.forecast.history import (
     CENSORED,
     CUT,
     NONE,
+    STATUSES,
     Codes,
     Runs,
     RunVocabulary,
@@ -38,6 +39,7 @@ from petrobot.coordinator.studies.forecast.history import (
     Values,
     Waits,
 )
+from petrobot.coordinator.task import Status
 
 ALPHA = 0.01
 """Significance level of a split, over all factors of a node (Bonferroni)."""
@@ -148,6 +150,12 @@ class RunDistributions:
         for key in sorted(set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))):
             own = runs.of((runs.place == key[0]) & (runs.action == key[1]))
             self.contexts[key] = self._grow(own, DEEPEST if unfold else 0, outcomes=True)
+        self.deadlines = {
+            place: _deadline(training, place, runs.of(runs.place == place))
+            for place in {place for place, _ in self.contexts}
+        }
+        """By place code: the longest time of a run there (s), and the outcome of one that is ended
+        then."""
 
     @property
     def count(self) -> int:
@@ -196,6 +204,19 @@ class RunDistributions:
                     )
                 stack += [*node.children, *node.durations.values()]
         return out
+
+
+def _deadline(training: Training, place: int, runs: Runs) -> tuple[float, int]:
+    """Return after how long a run in a place is ended, and its outcome then: the usual one of the
+    ends with ERROR. Measured times may be longer: they include waits, for a device for example."""
+    task, vocabulary = training.task.flat, training.vocabulary
+    name = vocabulary.places[place]
+    timeout = task.places[name].timeout
+    limit = min(task.primitive_task_of(name).deadline, np.inf if timeout is None else timeout)
+    error = STATUSES.index(Status.ERROR)
+    ended = runs.outcome[(runs.outcome > CUT) & (vocabulary.parts(runs.outcome)[0] == error)]
+    outcome = int(np.bincount(ended).argmax()) if len(ended) else vocabulary.outcome(error, -1)
+    return max(limit, float(runs.took.max())), outcome
 
 
 def with_weights(runs: Runs) -> Runs:
@@ -405,6 +426,10 @@ class Drawer:
         for code in np.unique(action):
             top = self._runs.contexts[place, int(code)]
             self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
+        if out.beyond.any():  # the extrapolation knows no deadline
+            longest, outcome = self._runs.deadlines[place]
+            late = out.beyond & np.isfinite(out.took) & (out.took > longest)
+            out.took[late], out.outcome[late], out.preempted[late] = longest, outcome, False
         return out
 
     def _descend(

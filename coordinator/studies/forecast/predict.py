@@ -351,7 +351,9 @@ class _SimulatedNet:
             RunDistributions(training),
         )
         self._training = training
-        # steps after which a simulated trial counts as endless
+        # Steps after which a simulated trial counts as endless (the forecast says how many did).
+        # A heuristic: of n trials with geometric numbers of steps, one more is five times as long
+        # as the longest with a probability of about 5! / n^5, which is 1e-6 for n = 40.
         longest = max(len(trial.runs) + len(trial.waits) for trial in training.trials)
         self._longest = 100 + 5 * longest
 

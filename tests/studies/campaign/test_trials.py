@@ -12,7 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from petrobot.coordinator.cli.loading import load_task
-from petrobot.coordinator.engine.instructions import Corrected
+from petrobot.coordinator.engine import (
+    Begin,
+    Chosen,
+    Corrected,
+    Engine,
+    EventOccurred,
+    RunEnded,
+    Stimulus,
+    StopConfirmed,
+)
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.learning.records import Waited, WaitEnd
 from petrobot.coordinator.run.mission import Mission
@@ -84,6 +93,30 @@ def test_an_error_branch_belongs_to_its_trial() -> None:
     assert first.fired["recovered"] == first.fired["arm_back"] == 1
     assert first.completed and not first.all_success
     assert second.status == "success" and "recovered" not in second.fired
+
+
+def test_a_preempted_run_costs_the_time_until_its_token_was_taken() -> None:
+    """As for `run --learn`: its node says some time later that it has stopped."""
+    task = load_task("catch_ball")
+    engine, log = Engine(task), TrialLog(task, lambda record, values: record.seconds)
+    state = engine.initial()
+    script: list[tuple[float, Stimulus]] = [
+        (0.0, Begin()),
+        (1.0, EventOccurred("image_tick")),
+        (1.0, Chosen("locate_ball#1", "locate_hough")),
+        (2.0, RunEnded("locate_ball#1", Status.SUCCESS)),
+        (2.0, Chosen("move_to_point#1", "intercept_tilted")),
+        (2.5, EventOccurred("ball_caught")),
+        (2.504, StopConfirmed("move_to_point#1", seconds=0.504)),
+    ]
+    for now, stimulus in script:
+        log.stimulus(now, stimulus)
+        state, said = engine.handle(state, stimulus)
+        for one in said:
+            log.instruction(now, one)
+        log.settled(now, state)
+    (run,) = [run for run in log.trials[0].runs if run.cancelled]
+    assert (run.taken, run.took, run.seconds, run.cost) == ("caught_early", 0.5, 0.504, 0.5)
 
 
 def test_giving_up_leaves_later_trials_unstarted() -> None:

@@ -20,12 +20,16 @@ from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.distributions import RunDistributions, with_weights
-from petrobot.coordinator.studies.forecast.history import NONE, Training
+from petrobot.coordinator.studies.forecast.distributions import (
+    Drawer,
+    RunDistributions,
+    with_weights,
+)
+from petrobot.coordinator.studies.forecast.history import NONE, STATUSES, Seen, Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
 from petrobot.coordinator.studies.forecast.residual import measured
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.conftest import with_transitions
 
@@ -423,6 +427,32 @@ def test_beyond_the_longest_run_by_hand() -> None:
     assert context.ends.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
     assert context.ends.beyond.tolist() == [False, True, True]
     assert context.ends.rate == pytest.approx(-math.log(2 / 3) / 3.0)
+
+
+def test_a_run_beyond_the_longest_one_ends_at_the_latest_at_its_deadline() -> None:
+    """Then it ends with ERROR, although the extrapolation would go on at a constant rate."""
+    task = loads(ONE_WAY, "scan.toml")
+    deadline = task.primitive_tasks["watch"].deadline
+    runs = [("success", 1.0, "")] + [("", deadline - 1.0, "found")] * 9
+    trials = [
+        Trial(
+            1,
+            0.0,
+            runs=[
+                RunEntry("watch", "watch_a", 0.0, took, status, taken=taken, cancelled=bool(taken))
+            ],
+        )
+        for status, took, taken in runs
+    ]
+    training = Training.of(task, trials)
+    n, code = 500, training.vocabulary.actions.index("watch_a") + 1
+    drawer = Drawer(RunDistributions(training), {}, np.ones((1, 10)), np.random.default_rng(1))
+    place, zeros = training.vocabulary.places.index("watch"), np.zeros(n, np.int64)
+    seen = Seen.nothing(len(training.vocabulary.places), n)
+    ends = drawer.ends(place, np.full(n, code), zeros, seen)
+    assert float(ends.took.max()) == deadline
+    status, _ = training.vocabulary.parts(ends.outcome[ends.took == deadline])
+    assert {STATUSES[s] for s in status.tolist()} == {Status.ERROR}
 
 
 def test_without_measurements_declared_durations_race(tmp_path: object) -> None:
