@@ -9,12 +9,13 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from petrobot.coordinator.drawing.layout import lay_out
+from petrobot.coordinator.drawing.layout import COLUMN, WIDEST, lay_out
 from petrobot.coordinator.page.edits import edited, parse, plain
 from petrobot.coordinator.page.server import Page
 from petrobot.coordinator.task.file import load
@@ -477,30 +478,50 @@ async def test_the_page_has_the_same_layout_as_the_command_line(
     browser: Browser, page: Page
 ) -> None:
     """The two implementations of the layout, in Python and in the page, give random nets the same
-    positions."""
+    positions; also long ones, which are folded, with resources beside their layers."""
     tab, _ = await designing(browser, page)
-    script = """async ([names, edges, sources]) => {
+    script = """async ([names, edges, sources, aside]) => {
       const { layered } = await import("/page/js/layers.js");
-      return layered(names, edges, sources);
+      return layered(names, edges, sources, aside);
     }"""
-    for seed in range(12):
-        net = random_task(np.random.default_rng(seed), 3)
-        edges = [
-            (net.places[p], t)
-            for t, takes in zip(net.transitions, net.consume, strict=True)
-            for p, _ in takes
-        ]
-        edges += [
-            (t, net.places[p])
-            for t, gives in zip(net.transitions, net.produce, strict=True)
-            for p, _ in gives
-        ]
-        names = [*net.places, *net.transitions]
-        sources = [p for p, n in zip(net.places, net.initial, strict=True) if n]
-        here = lay_out(dict.fromkeys(names), edges, sources).at
-        there = await tab.evaluate(script, [names, edges, sources])
-        assert there.keys() == here.keys()
-        assert [there[n] for n in names] == [pytest.approx(here[n]) for n in names]
+    for names, edges, sources, aside in [*map(short_net, range(12)), *map(long_net, range(6))]:
+        laid = lay_out(dict.fromkeys(names), edges, sources, aside)
+        there = await tab.evaluate(script, [names, edges, sources, aside])
+        assert there.keys() == laid.at.keys()
+        assert [there[n] for n in names] == [pytest.approx(laid.at[n]) for n in names]
+        across = {x for x, _ in laid.at.values()}
+        assert bool(aside) <= (max(across) - min(across) <= WIDEST * COLUMN)
+
+
+Drawn = tuple[list[str], list[tuple[str, str]], list[str], list[str]]
+"""Names, edges, sources and the nodes beside the layers of a net."""
+
+
+def short_net(seed: int) -> Drawn:
+    net = random_task(np.random.default_rng(seed), 3)
+    steps = zip(net.transitions, net.consume, net.produce, strict=True)
+    edges = [
+        edge
+        for t, takes, gives in steps
+        for edge in (
+            *((net.places[p], t) for p, _ in takes),
+            *((t, net.places[p]) for p, _ in gives),
+        )
+    ]
+    sources = [p for p, n in zip(net.places, net.initial, strict=True) if n]
+    return [*net.places, *net.transitions], edges, sources, []
+
+
+def long_net(seed: int) -> Drawn:
+    """Return a chain of 34 to 84 nodes with arcs over many of them, and two resources."""
+    random = np.random.default_rng(seed)
+    chain = [f"n{i}" for i in range(34 + 10 * seed)]
+    edges = list(pairwise(chain))
+    for a, b in random.integers(len(chain), size=(8, 2)).tolist():
+        edges.append((chain[a], chain[b]))
+    for i in random.integers(len(chain), size=6).tolist():
+        edges.append((chain[i], "arm") if i % 2 else ("base", chain[i]))
+    return [*chain, "arm", "base"], edges, ["n0", "arm", "base"], ["arm", "base"]
 
 
 COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8")

@@ -7,18 +7,79 @@ const TIGHTENINGS = 12;
 const COLUMN = 120;
 const APART = [105, 58, 24]; // between nodes, node and way point, way points
 const MARGIN = 80;
+const WIDEST = 14;
+const FOLDED_FROM = 28;
 const SETTLINGS = 20;
 const STRAIGHT = [1, 3, 9];
 
 const point = (a, b, column) => `\u0000${a}\u0000${b}\u0000${column}`;
 const isPoint = (spot) => spot.startsWith("\u0000");
 
-/** Positions {name: [x, y]} of nodes joined by `edges` [[from, to], ...]; the flow begins at `sources`. */
-export function layered(names, edges, sources) {
+/**
+ * Positions {name: [x, y]} of nodes joined by `edges` [[from, to], ...]; the flow begins at `sources`. A wide layout leaves the
+ * nodes `aside` out of its layers.
+ */
+export function layered(names, edges, sources, aside = []) {
   const layers = new Layers(names, edges, sources);
+  if (layers.columns.length < FOLDED_FROM) return named(names, spotsOf(layers));
+  const beside = new Set(aside);
+  const inner = names.filter((name) => !beside.has(name));
+  const joined = edges.filter((edge) => !edge.some((end) => beside.has(end)));
+  const long = new Layers(inner, joined, sources.filter((name) => !beside.has(name)));
+  return filledIn(names, named(inner, folded(spotsOf(long), long.columns.length)), edges);
+}
+
+const named = (names, spots) => Object.fromEntries(names.map((name) => [name, spots.get(name)]));
+
+/** Positions of all nodes and way points: Map(spot -> [x, y]). */
+function spotsOf(layers) {
   const row = settled(layers);
   const top = row.size ? Math.min(...row.values()) : 0;
-  return Object.fromEntries(names.map((name) => [name, [MARGIN + layers.column.get(name) * COLUMN, MARGIN + row.get(name) - top]]));
+  return new Map(layers.columns.flatMap((column, i) => column.map((spot) => [spot, [MARGIN + i * COLUMN, MARGIN + row.get(spot) - top]])));
+}
+
+/** The same in bands of equally many columns; each second one runs to the left. */
+function folded(spots, columns) {
+  const bands = Math.ceil(columns / WIDEST);
+  const per = Math.ceil(columns / bands);
+  const columnOf = (x) => Math.round((x - MARGIN) / COLUMN);
+  let top = MARGIN;
+  const tops = Array.from({ length: bands }, (_, band) => {
+    const ys = [...spots.values()].filter(([x]) => Math.floor(columnOf(x) / per) === band).map(([, y]) => y);
+    const [least, most] = ys.length ? [Math.min(...ys), Math.max(...ys)] : [MARGIN, MARGIN];
+    const shift = top - least;
+    top += most - least + 1.5 * APART[0];
+    return shift;
+  });
+  const at = ([x, y]) => {
+    const band = Math.floor(columnOf(x) / per);
+    const column = columnOf(x) - band * per;
+    return [MARGIN + (band % 2 ? per - 1 - column : column) * COLUMN, y + tops[band]];
+  };
+  return new Map([...spots].map(([spot, point]) => [spot, at(point)]));
+}
+
+/** The positions with those of the other nodes: each near its neighbours, at the nearest free spot. */
+function filledIn(names, positions, edges) {
+  const at = { ...positions };
+  for (const name of names.filter((n) => !(n in at))) {
+    const near = edges.filter((edge) => edge.includes(name)).map(([a, b]) => at[a === name ? b : a]).filter(Boolean);
+    const lowest = Math.max(0, ...Object.values(at).map(([, y]) => y));
+    const centre = near.length ? [0, 1].map((i) => near.reduce((sum, p) => sum + p[i], 0) / near.length) : [MARGIN, lowest + APART[0]];
+    at[name] = freeSpot(centre, Object.values(at));
+  }
+  return at;
+}
+
+function freeSpot([x, y], taken) {
+  const far = ([a, b]) => taken.every(([c, d]) => Math.abs(a - c) >= COLUMN * 0.7 || Math.abs(b - d) >= APART[0] * 0.7);
+  for (let ring = 0; ; ring++) {
+    const steps = Array.from({ length: 2 * ring + 1 }, (_, i) => i - ring);
+    const around = steps.flatMap((dx) => steps.filter((dy) => Math.max(Math.abs(dx), Math.abs(dy)) === ring).map((dy) => [x + (dx * COLUMN) / 2, y + (dy * APART[0]) / 2]));
+    const away = ([a, b]) => (a - x) ** 2 + (b - y) ** 2;
+    const free = around.filter(far);
+    if (free.length) return free.reduce((best, spot) => (away(spot) < away(best) ? spot : best));
+  }
 }
 
 class Layers {

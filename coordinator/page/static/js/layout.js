@@ -11,8 +11,9 @@ export function automatic(net) {
   const known = new Set(names);
   const edges = net.arcs.filter((a) => known.has(a.place) && known.has(a.transition)).map((a) => (a.direction === "out" ? [a.transition, a.place] : [a.place, a.transition]));
   const sources = net.places.filter((p) => p.tokens).map((p) => p.name);
-  const key = JSON.stringify([names, edges, sources]);
-  if (last.key !== key) last = { key, positions: layered(names, edges, sources) };
+  const aside = net.places.filter((p) => p.kind === "resource" && p.tokens).map((p) => p.name);
+  const key = JSON.stringify([names, edges, sources, aside]);
+  if (last.key !== key) last = { key, positions: layered(names, edges, sources, aside) };
   return Object.fromEntries(Object.entries(last.positions).map(([name, [x, y]]) => [name, [snap(x), snap(y)]]));
 }
 
