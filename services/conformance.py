@@ -59,6 +59,11 @@ LARGEST_STATE = 100_000
 """Most items and characters of a state: it is sent after each step."""
 JUMP = 3.0
 """Multiple of its fastest step by which a position may change at once."""
+MEASURED = (
+    "if that is measured and no position, name what is one (`positions`, --position), or for a "
+    "sensor give no commands"
+)
+"""Remedy if numbers of the state were taken for positions."""
 NAMED = 6
 """Most names of a message."""
 STARTING = 2
@@ -636,7 +641,8 @@ class _Check:
         found = {name: far for name, far in found.items() if far >= least}
         # each position by itself: one joint may settle while another only begins
         if judged and (lied := {name for name in found if untrue[name] > STARTING}):
-            self.fault(f"stopped: True during {dict(command)}, while {_names(lied)} changed")
+            text = f"stopped: True during {dict(command)}, while {_names(lied)} changed"
+            self.fault(text if self.positions else f"{text}; {MEASURED}")
         return found
 
     def accepts(self, command: Command) -> bool:

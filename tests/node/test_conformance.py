@@ -463,7 +463,10 @@ class DrawsByItself(Axis):
         (QuickStopsOnce, "quick_stop, a second time: RuntimeError: already stopped"),
         (Backwards, "period: expected seconds above 0 or None, got -0.01"),
         (NeverStops, "stop during a movement: stopped() is still False after 1 s"),
-        (SaysItStands, "stopped: True during {'to': 0.2}, while axis[0].at changed"),
+        (
+            SaysItStands,
+            "stopped: True during {'to': 0.2}, while axis[0].at changed; if that is measured",
+        ),
         (RunsOnAfterStop, "stop during a movement: stopped() is True, and axis[0].at still"),
         (StopsOnce, "stop, a second time: RuntimeError: already stopped"),
         (TakesAll, "command: accepted"),
