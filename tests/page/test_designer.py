@@ -55,7 +55,7 @@ async def designing(
     tab.on(
         "console", lambda message: complaints.append(message.text) if is_fault(message) else None
     )
-    await tab.goto(f"{page.url}#Design")
+    await tab.goto(f"{page.url}#design")
     await settled(tab)
     await expect(tab.get_by_label("Task", exact=True)).to_have_value("pick_and_place")
     await note_toasts(tab)

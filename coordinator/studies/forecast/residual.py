@@ -285,7 +285,8 @@ def order_doubts(training: Training) -> list[str]:
         return [
             f"{both} of the training's {n} trials began before an earlier one had ended: their "
             "times contain waits for each other, so they hold for as many runs at a time, and the "
-            "stochastic view, which has one, does not show them"
+            "stochastic view, which has one, does not show them; without `runs_place` a trial is "
+            "the whole mission, which has no such waits"
         ]
     real, found, mission = measured(training), [], missions(training)
     done = ~np.isnan(real.time)

@@ -32,10 +32,15 @@ class App {
     root.replaceChildren(this.header, this.lost.root, this.operator.bar, this.stage);
     this.setTheme(localStorage.getItem("petrobot.theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
     this.setWall(localStorage.getItem("petrobot.wall") === "yes");
-    this.show(location.hash.slice(1) in this.tabs ? location.hash.slice(1) : "Live");
+    this.show(this.addressed() ?? "Live");
     setInterval(() => this.tick(), TICK_MS);
     new ResizeObserver(() => document.documentElement.style.setProperty("--head", `${this.header.offsetHeight}px`)).observe(this.header); // dialogs leave it free
-    addEventListener("hashchange", () => location.hash.slice(1) in this.tabs && this.show(location.hash.slice(1)));
+    addEventListener("hashchange", () => this.addressed() && this.show(this.addressed()));
+  }
+
+  /** The tab that the address names (…#design). */
+  addressed() {
+    return Object.keys(this.tabs).find((name) => `#${name}`.toLowerCase() === location.hash.toLowerCase());
   }
 
   get dark() {
