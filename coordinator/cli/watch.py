@@ -74,8 +74,10 @@ def _write(out: TextIO, text: str) -> None:
 def _snapshot(client: OperatorClient) -> str:
     mission, controls = client.state["mission"], client.state["controls"]
     tokens = ", ".join(f"{place} {n}" for place, n in client.state["marking"].items() if n)
+    paused = client.state["paused"]
+    state = mission["state"] if paused is None else f"paused ({paused['reason']})"
     return (
-        f"{mission['id']}: {mission['state']}; controls: "
+        f"{mission['id']}: {state}; controls: "
         f"{controls['holder'] or 'no operator'}; tokens: {tokens}"
     )
 

@@ -148,43 +148,59 @@ def can_still_fire(draft: Draft, x: CompiledTransition) -> bool:
     return any(_condition_can_hold(draft, x, runs) for runs in _selections(x, eligible))
 
 
-def waiting_for(draft: Draft, chances: bool = True) -> str:
-    """Return in words what the tokens wait for: with `chances` which event or variable, for each
-    transition that can still fire; then what keeps others from firing that could take an ended run
-    or a token on its way, or if there is none any token. Those that only lack a resource come
-    first, since another waiting token may hold it."""
+def waiting_for(draft: Draft) -> str:
+    """Return in words which event or variable each transition waits for that can still fire, and
+    what keeps each one from firing that could take an ended run, or with no such run any that has
+    some of its tokens. Journals hold a checksum of this text."""
+    ended = _ended_places(draft)
+    marked = {p for p, n in enumerate(draft.marking) if n}
+    found = _chances(draft) + [text for _, text in _hindered(draft, ended or marked)]
+    return "; ".join(found) or "no transition takes any of its tokens"
+
+
+def stuck_for(draft: Draft, chances: bool) -> str:
+    """Return the same more briefly, for people: also what tokens on their way wait for, and of at
+    most `MOST_TOLD` transitions what keeps them from firing. Those that lack nothing but a resource
+    come first: another waiting token holds it. Without `chances`, events and variables are left
+    out."""
     compiled = draft.compiled
     kinds = [compiled.task.places[place].kind for place in compiled.net.places]
     marked = {p for p, n in enumerate(draft.marking) if n}
-    ended = {
-        compiled.action_places[r.place]
-        for runs in draft.tokens.values()
-        for r in runs
-        if r.phase is Phase.DONE
-    }
-    waiting = ended | {p for p in marked if kinds[p] is Kind.PLAIN}
-    near = waiting or marked
-    found = [
-        (x, lacks)
-        for x in compiled.transitions
-        if near & {p for p, _ in x.needs} and (lacks := obstacles(draft, x))
-    ]
+    waiting = _ended_places(draft) | {p for p in marked if kinds[p] is Kind.PLAIN}
 
     def nearness(lacks: list[Obstacle]) -> tuple[bool, int]:
         owned = all(o.place is not None and kinds[o.place] is Kind.RESOURCE for o in lacks)
         return not owned, len(lacks)
 
-    found.sort(key=lambda each: nearness(each[1]))
-    told = [f"{x.name} {' and '.join(o.text for o in lacks)}" for x, lacks in found]
-    if len(told) > MOST_TOLD:
-        told[MOST_TOLD:] = [f"and {len(told) - MOST_TOLD} more"]
-    if chances:
-        told[:0] = [
-            f"{x.name} waits for {in_words(draft, x)}"
-            for x in compiled.transitions
-            if can_still_fire(draft, x)
-        ]
-    return "; ".join(told) or "no transition takes any of its tokens"
+    hindered = sorted(_hindered(draft, waiting or marked), key=lambda found: nearness(found[0]))
+    told = (_chances(draft) if chances else []) + [text for _, text in hindered[:MOST_TOLD]]
+    if len(hindered) > MOST_TOLD:
+        told.append(f"and {len(hindered) - MOST_TOLD} more")
+    return "; ".join(told) or "no transition lacks anything, but none leads to the end"
+
+
+def _ended_places(draft: Draft) -> set[int]:
+    """Return the places with a run that has ended."""
+    runs = (run for runs in draft.tokens.values() for run in runs)
+    return {draft.compiled.action_places[r.place] for r in runs if r.phase is Phase.DONE}
+
+
+def _chances(draft: Draft) -> list[str]:
+    return [
+        f"{x.name} waits for {in_words(draft, x)}"
+        for x in draft.compiled.transitions
+        if can_still_fire(draft, x)
+    ]
+
+
+def _hindered(draft: Draft, near: Collection[int]) -> list[tuple[list[Obstacle], str]]:
+    """Return what keeps the transitions with an input among these places from firing, also in
+    words."""
+    return [
+        (lacks, f"{x.name} {' and '.join(o.text for o in lacks)}")
+        for x in draft.compiled.transitions
+        if any(p in near for p, _ in x.needs) and (lacks := obstacles(draft, x))
+    ]
 
 
 def can_end(draft: Draft) -> bool:

@@ -140,7 +140,7 @@ class CoordinatorParty:
             if not self.attended and not engine.can_end(executor.state):
                 why, chances = "the task can never end, whatever still happens", False
         if why and not self.attended:
-            missing = engine.waiting_for(executor.state, chances)
+            missing = engine.stuck_for(executor.state, chances)
             executor.stimulate(now, Abort(f"{why}, and no operator can act: {missing}", stuck=True))
 
     def drain(self) -> Sequence[Envelope]:

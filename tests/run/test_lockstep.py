@@ -126,7 +126,7 @@ def test_progress_begins_a_new_wait() -> None:
     assert end is None
 
 
-CROSSED = '''schema = 1
+CROSSED = """schema = 1
 [task]
 name = "crossed"
 final = "done == 2"
@@ -148,7 +148,7 @@ second = { in = ["two", "arm"], out = ["done", "arm"] }
 blink = { in = ["blinks"], out = ["work"], event = "tick" }
 blinked = { in = ["work:normal"], out = ["blinks"] }
 dark = { in = ["work:error"], out = ["blinks"] }
-'''
+"""
 """Each part holds what the other needs. Beside them a branch goes on that is not of the task."""
 
 

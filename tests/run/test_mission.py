@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.engine import Corrected, Engine, Fired, Report, RunRecorded
+from petrobot.coordinator.engine import Corrected, Engine, Finished, Fired, Report, RunRecorded
 from petrobot.coordinator.engine.instructions import Marked, Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
@@ -84,6 +84,26 @@ def test_a_cycle_without_end_needs_no_more_memory(monkeypatch: pytest.MonkeyPatc
     assert cycle.worst == (Status.ERROR, "slipped", "")
 
 
+@pytest.mark.parametrize(
+    ("reason", "told"),
+    [
+        ("a == 0", "a == 0"),
+        ("(a == 0) and b == 0", "a == 0, and the other plain place is empty"),
+        (
+            "((a == 0) or (b > 1)) and c.begin == 0 and d == 0; x#1 could not be stopped",
+            "(a == 0) or (b > 1), and the other 2 plain places are empty; x#1 could not be stopped",
+        ),
+        ("(a == 0) and (b == 1) and c == 0", "(a == 0) and (b == 1) and c == 0"),
+        ("(a == 0) and b == 1", "(a == 0) and b == 1"),
+    ],
+)
+def test_the_reason_of_the_end_names_what_the_file_says(reason: str, told: str) -> None:
+    """A task with subnets has dozens of plain places, and the reason had twenty lines."""
+    what = "final marking reached: "
+    assert Finished(Status.SUCCESS, what + reason).told == what + told
+    assert Finished(Status.ERROR, "given up: (a == 0)").told == "given up: (a == 0)"
+
+
 def test_four_runs_reach_final(catch_ball: Task) -> None:
     """The initial marking of figure 1 has four run tokens."""
     mission, timeline = run(catch_ball, {})
@@ -97,17 +117,17 @@ def test_four_runs_reach_final(catch_ball: Task) -> None:
 @pytest.mark.parametrize(
     ("status", "text", "told"),
     [
-        (Status.SUCCESS, "by caught", "by caught, which counts as SUCCESS"),
-        (None, "by caught", "by caught, which is not counted"),
+        (Status.SUCCESS, "by caught", "by caught, counted as success"),
+        (None, "by caught", "by caught, not counted"),
         (
             Status.SUCCESS,
             "by caught; it had ended with error, cancelled",
-            "by caught, which counts as SUCCESS",
+            "by caught, counted as success",
         ),
         (
             None,
             "by caught; it had ended with failure, slow",
-            "by caught, which is not counted; its own result came too late: failure, slow",
+            "by caught, not counted; its own result came too late: failure, slow",
         ),
     ],
 )
