@@ -102,7 +102,7 @@ def _print(answers: dict[str, Any]) -> None:
         "address",
         "",
         *(["certificate ends"] if certified else []),
-        "offers, or why not up",
+        "offers",
         "devices",
     ):
         table.add_column(column)
