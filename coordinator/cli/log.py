@@ -201,7 +201,7 @@ def _lines(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]
         elif isinstance(one, Report):
             yield one.severity.value, one.of, one.text
         elif isinstance(one, Finished):
-            yield "finished", "", f"{one.status.value.upper()}: {one.reason}"
+            yield "finished", "", f"{one.status.value.upper()}: {one.told}"
 
 
 def _cause(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]:

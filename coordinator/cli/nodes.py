@@ -113,6 +113,8 @@ def _print(answers: dict[str, Any]) -> None:
             if answer["up"]
             else "[yellow]not ready[/]"
             if troubles
+            else "[yellow]refuses us[/]"
+            if answer.get("refuses")
             else "[red]away[/]"
         )
         shown = _devices(answer.get("status", {}), answer.get("stopped", []), troubles)

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1
+NOTE = 60.0
+"""Wall time between two lines about an active run where no line can be refreshed (s)."""
 LONGEST_TABLE = 24
 WIDEST_TABLE = 9
 """Most columns of a table in the terminal; --json and the report show wider ones."""
@@ -67,18 +69,21 @@ def kept_streams() -> Iterator[None]:
 @contextmanager
 def live_progress() -> Iterator[Callable[[Mission, float], None]]:
     """Show a line about the active run, at most every 0.1 s of wall time; calls in between do
-    nothing."""
-    shown = 0.0
-    with Live(
-        Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True
-    ) as live:
+    nothing. Without a terminal it cannot be refreshed: then print one each minute."""
+    console, shown = Console(stderr=True), time.monotonic()
+    pause = REFRESH if console.is_terminal else NOTE
+    with Live(Text("connecting"), console=console, auto_refresh=False, transient=True) as live:
 
         def watch(mission: Mission, now: float) -> None:
             nonlocal shown
             wall = time.monotonic()
-            if wall - shown >= REFRESH and not getattr(sys.stderr, "closed", False):
+            if wall - shown >= pause and not getattr(sys.stderr, "closed", False):
                 shown = wall
-                live.update(_line(mission, now), refresh=True)
+                line = _line(mission, now)
+                if console.is_terminal:
+                    live.update(line, refresh=True)
+                else:
+                    print(f"still active: {line.plain.strip()}", file=sys.stderr, flush=True)
 
         yield watch
 

@@ -36,6 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
     )
+    parser.add_argument(
+        "--up",
+        action="store_true",
+        help="start the nodes of this host again, and stop them after the run (a killed `run --up` "
+        "has left none)",
+    )
     add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_log_level_argument(parser)
@@ -125,10 +131,13 @@ def _addresses(header: Mapping[str, Any]) -> set[tuple[str, int]]:
 
 
 def _result_of(path: Path) -> dict[str, Any] | None:
-    """Return the result that a run has written. None if there is none, or a partial one, which the
-    resumed run then overwrites."""
+    """Return the result that a run has written. None if there is none, or one that is partial or
+    lacks its score, which the resumed run then overwrites."""
+    from petrobot.coordinator.run.mission import UNSCORED
+
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
         return None
-    return result if isinstance(result, dict) and "status" in result else None
+    whole = isinstance(result, dict) and "status" in result and UNSCORED not in result
+    return result if whole else None

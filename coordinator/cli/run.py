@@ -307,7 +307,7 @@ def conduct(
     from petrobot.coordinator.operator.session import interruptible
     from petrobot.coordinator.operator.start_from import DepartureError
     from petrobot.coordinator.run.journal import JournalError
-    from petrobot.coordinator.run.mission import MissionError
+    from petrobot.coordinator.run.mission import UNSCORED, MissionError
     from petrobot.coordinator.run.realtime import UnreachableError
     from petrobot.coordinator.run.recording import JournalStore, ReplayError
     from petrobot.coordinator.run.supervisor import LaunchError
@@ -331,7 +331,8 @@ def conduct(
     except KeyboardInterrupt:
         folder = made[0].folder if made and made[0].mission.executor.finished is None else None
         if folder is not None and folder.exists():  # one that had not begun leaves none
-            print(f"`petrobot resume {folder}` continues this run", file=sys.stderr)
+            up = " --up" * getattr(options, "up", False)
+            print(f"`petrobot resume {folder}{up}` continues this run", file=sys.stderr)
         raise
     except MissionError as fault:
         raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
@@ -347,7 +348,8 @@ def conduct(
     [session] = made
     give(session, options, timeline)
     tidy(options, session.folder)
-    return 0 if session.result()["status"] == "success" else 1
+    result = session.result()
+    return 0 if result["status"] == "success" and UNSCORED not in result else 1
 
 
 async def _lead_lockstep(session: RunSession, options: argparse.Namespace) -> None:

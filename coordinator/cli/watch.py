@@ -55,7 +55,9 @@ async def _watch(options: argparse.Namespace, out: TextIO) -> int:
 
 
 async def _follow(client: OperatorClient, out: TextIO, plain: bool) -> int:
-    _write(out, _snapshot(client) if plain else json_text({"kind": "snapshot", **client.state}))
+    _write(
+        out, _snapshot(client.state) if plain else json_text({"kind": "snapshot", **client.state})
+    )
     async for change in client.changes():
         text = _line(change) if plain else json_text(change)
         if text:
@@ -71,12 +73,12 @@ def _write(out: TextIO, text: str) -> None:
     out.flush()
 
 
-def _snapshot(client: OperatorClient) -> str:
-    mission, controls = client.state["mission"], client.state["controls"]
-    tokens = ", ".join(f"{place} {n}" for place, n in client.state["marking"].items() if n)
+def _snapshot(state: Mapping[str, Any]) -> str:
+    mission, controls, paused = state["mission"], state["controls"], state["paused"]
+    tokens = ", ".join(f"{place} {n}" for place, n in state["marking"].items() if n)
+    how = mission["state"] if paused is None else f"paused ({paused['reason']})"
     return (
-        f"{mission['id']}: {mission['state']}; controls: "
-        f"{controls['holder'] or 'no operator'}; tokens: {tokens}"
+        f"{mission['id']}: {how}; controls: {controls['holder'] or 'no operator'}; tokens: {tokens}"
     )
 
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from itertools import product
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
 from petrobot.coordinator.engine.state import ACTIVE, LIVE, Phase, Run
-from petrobot.coordinator.task import Counts, End, Status, Value
+from petrobot.coordinator.task import Counts, End, Kind, Status, Value
 from petrobot.coordinator.task.compiled_task import ActionArc, CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.conditions.regions import can_hold
+from petrobot.coordinator.task.validation import marking_domains
 from petrobot.coordinator.task.wording import Severity
 
 DEAD_END = "dead_end"
 """Key of the report that nothing can happen any more although no final marking is reached."""
+MOST_TOLD: Final = 5
+"""Most transitions of which a message says what keeps them from firing."""
 
 
 class Match(NamedTuple):
@@ -148,23 +151,100 @@ def can_still_fire(draft: Draft, x: CompiledTransition) -> bool:
 def waiting_for(draft: Draft) -> str:
     """Return in words which event or variable each transition waits for that can still fire, and
     what keeps each one from firing that could take an ended run, or with no such run any that has
-    some of its tokens."""
-    ended = {r.place for runs in draft.tokens.values() for r in runs if r.phase is Phase.DONE}
-    near = [x for x in draft.compiled.transitions if ended & {a.name for a in x.actions}]
-    if not ended:
-        marked = {p for p, n in enumerate(draft.marking) if n}
-        near = [x for x in draft.compiled.transitions if marked & {p for p, _ in x.needs}]
-    chances = [
+    some of its tokens. Journals hold a checksum of this text."""
+    ended = _ended_places(draft)
+    marked = {p for p, n in enumerate(draft.marking) if n}
+    found = _chances(draft) + [text for _, text in _hindered(draft, ended or marked)]
+    return "; ".join(found) or "no transition takes any of its tokens"
+
+
+def stuck_for(draft: Draft, chances: bool) -> str:
+    """Return the same more briefly, for people: also what tokens on their way wait for, and of at
+    most `MOST_TOLD` transitions what keeps them from firing. Those that lack nothing but a resource
+    come first: another waiting token holds it. Without `chances`, events and variables are left
+    out."""
+    compiled = draft.compiled
+    kinds = [compiled.task.places[place].kind for place in compiled.net.places]
+    marked = {p for p, n in enumerate(draft.marking) if n}
+    waiting = _ended_places(draft) | {p for p in marked if kinds[p] is Kind.PLAIN}
+
+    def nearness(lacks: list[Obstacle]) -> tuple[bool, int]:
+        owned = all(o.place is not None and kinds[o.place] is Kind.RESOURCE for o in lacks)
+        return not owned, len(lacks)
+
+    hindered = sorted(_hindered(draft, waiting or marked), key=lambda found: nearness(found[0]))
+    told = (_chances(draft) if chances else []) + [text for _, text in hindered[:MOST_TOLD]]
+    if len(hindered) > MOST_TOLD:
+        told.append(f"and {len(hindered) - MOST_TOLD} more")
+    return "; ".join(told) or "no transition lacks anything, but none leads to the end"
+
+
+def _ended_places(draft: Draft) -> set[int]:
+    """Return the places with a run that has ended."""
+    runs = (run for runs in draft.tokens.values() for run in runs)
+    return {draft.compiled.action_places[r.place] for r in runs if r.phase is Phase.DONE}
+
+
+def _chances(draft: Draft) -> list[str]:
+    return [
         f"{x.name} waits for {in_words(draft, x)}"
         for x in draft.compiled.transitions
         if can_still_fire(draft, x)
     ]
-    found = [
-        f"{x.name} {' and '.join(o.text for o in lacks)}"
-        for x in near
-        if (lacks := obstacles(draft, x))
+
+
+def _hindered(draft: Draft, near: Collection[int]) -> list[tuple[list[Obstacle], str]]:
+    """Return what keeps the transitions with an input among these places from firing, also in
+    words."""
+    return [
+        (lacks, f"{x.name} {' and '.join(o.text for o in lacks)}")
+        for x in draft.compiled.transitions
+        if any(p in near for p, _ in x.needs) and (lacks := obstacles(draft, x))
     ]
-    return "; ".join([*chances, *found]) or "no transition takes any of its tokens"
+
+
+def can_end(draft: Draft) -> bool:
+    """Return whether `final`, `final_error` or the firing of a goal transition is still possible,
+    whatever events, times and values come and however active runs end.
+
+    False is a proof. A place that only transitions can fill which themselves lack a token for ever
+    stays empty (a siphon; Murata 1989, section V), and a token that none of the others takes stays.
+    True proves nothing: a token counts as there for all transitions at once, and each condition as
+    one that may become true."""
+    compiled = draft.compiled
+    grows, shrinks = set[int](), set[int]()
+    left = list(compiled.transitions)
+    while found := [x for x in left if _possible(draft, x, grows, shrinks)]:
+        left = [x for x in left if not any(x is y for y in found)]
+        if any(x.name in compiled.task.goal_transitions for x in found):
+            return True
+        for x in found:
+            grows.update(p for p, change in x.changes if change > 0)
+            shrinks.update(p for p, change in x.changes if change < 0)
+            grows.update(p for p, _, is_action in x.produce if is_action)  # by a run of its own
+    places = compiled.net.places
+    held = dict(zip(places, draft.marking, strict=True))
+    free, domains = {places[p] for p in grows | shrinks}, marking_domains(compiled.task)
+    ends = (compiled.task.final, compiled.task.final_error)
+    return any(end is not None and can_hold(end, held, free, domains) for end in ends)
+
+
+def _possible(
+    draft: Draft, x: CompiledTransition, grows: Collection[int], shrinks: Collection[int]
+) -> bool:
+    """Return whether the transition might fire if these places could gain and lose any number of
+    tokens."""
+    marking = draft.marking
+    if x.never or any(marking[p] < w and p not in grows for p, w in x.needs):
+        return False
+    if any(marking[p] >= k and p not in shrinks for p, k in x.bars):
+        return False
+    return all(
+        arc.place in grows
+        or sum(r.phase in LIVE or _fits(arc, r) for r in draft.tokens.get(arc.name, ()))
+        >= arc.weight
+        for arc in x.actions
+    )
 
 
 def in_words(draft: Draft, x: CompiledTransition) -> str:

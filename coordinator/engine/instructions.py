@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from petrobot.coordinator.task import Counts, Executed, Status, Value
+from petrobot.coordinator.task.conditions import ConditionError, parse
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import Severity as Severity
 
@@ -151,9 +154,9 @@ class RunRecorded:
         if not self.cancelled:
             return ""
         reason, _, late = self.text.partition("; it had ended with ")
-        counts = f"counts as {self.status.value.upper()}" if self.status else "is not counted"
+        counts = f"counted as {self.status.value}" if self.status else "not counted"
         own = "" if late in ("", "error, cancelled") else f"; its own result came too late: {late}"
-        return f"{reason}, which {counts}{own}"
+        return f"{reason}, {counts}{own}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +208,27 @@ class Finished:
     status: Status
     reason: str
     variables: Mapping[str, Value] = field(default_factory=dict)
+
+    @property
+    def told(self) -> str:
+        """The reason for people: it counts the plain places that must be empty, which the task adds
+        to `final`, and names only what the file says. (Journals hold a checksum of `reason`.)"""
+        if (found := _WITH_EMPTY_PLACES.fullmatch(self.reason)) is None:
+            return self.reason
+        with suppress(ConditionError):
+            written, empty = parse(found["written"]), found["empty"].count(" == 0")
+            more = (
+                "the other plain place is" if empty == 1 else f"the other {empty} plain places are"
+            )
+            return f"{found['what']}{written}, and {more} empty{found['rest']}"
+        return self.reason
+
+
+_WITH_EMPTY_PLACES = re.compile(
+    r"(?P<what>final marking reached: )\((?P<written>.*)\)"
+    r"(?P<empty>( and [\w.]+ == 0)+)(?P<rest>(;.*)?)",
+    re.DOTALL,
+)
 
 
 Instruction = (

@@ -9,7 +9,7 @@ from typing import Any
 from petrobot.coordinator.engine import operator, runs
 from petrobot.coordinator.engine.compiled import compile_task
 from petrobot.coordinator.engine.draft import Draft
-from petrobot.coordinator.engine.firing import awaited, waiting_for
+from petrobot.coordinator.engine.firing import awaited, can_end, stuck_for
 from petrobot.coordinator.engine.instructions import (
     ArmTimer,
     CancelRun,
@@ -196,9 +196,14 @@ class Engine:
             or any(x in advancing and not timer.elapsed for x, timer in state.timers.items())
         )
 
-    def waiting_for(self, state: State) -> str:
-        """Return in words what each transition waits for."""
-        return waiting_for(Draft(self.compiled, state))
+    def can_end(self, state: State) -> bool:
+        """Return whether a running task may still end or meet a goal without an operator; False is
+        a proof."""
+        return state.mode is not Mode.RUNNING or can_end(Draft(self.compiled, state))
+
+    def stuck_for(self, state: State, chances: bool = True) -> str:
+        """Return in words what the tokens wait for; without `chances` only what they lack."""
+        return stuck_for(Draft(self.compiled, state), chances)
 
     def outstanding(self, state: State) -> tuple[Instruction, ...]:
         """Return the orders that are still in force, for a coordinator that takes over a state:

@@ -54,7 +54,10 @@ def find_address(name: str | None = None, folder: Path = DEFAULT) -> RunAddress:
         address = _read(run / ADDRESS_FILE)
         if address is None:
             _refuse_dead(run / ADDRESS_FILE)
-            raise NoRunError(f"{run.name} is not active: only an active run can be controlled")
+            raise NoRunError(
+                f"{run.name} is not active, or runs in lock step: only an active run in real time, "
+                "or one that the page started, can be watched or controlled"
+            )
         return address
     files = _newest_first(folder)
     addresses = [address for path in files if (address := _read(path)) is not None]
@@ -62,8 +65,8 @@ def find_address(name: str | None = None, folder: Path = DEFAULT) -> RunAddress:
         for path in files[:1]:
             _refuse_dead(path)
         raise NoRunError(
-            f"no run in {folder} is active; start one with `petrobot run`, or name its folder "
-            "with --journal"
+            f"no run in {folder} can be watched or controlled: none is active, or it runs in lock "
+            "step; start one in real time with `petrobot run`, or name its folder with --journal"
         )
     return addresses[0]
 

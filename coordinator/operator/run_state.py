@@ -298,7 +298,7 @@ class ChangePublisher:
             self.feed.emit("paused", time=time, paused=None)
         if self.feed.state["mission"]["state"] == "stopped":
             return  # The emergency stop holds until it is cleared, whatever the run's result.
-        self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})
+        self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.told})
 
     def _flags(self, time: float, before: frozenset[str], after: frozenset[str]) -> None:
         for name in before ^ after:

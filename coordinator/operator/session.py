@@ -35,7 +35,7 @@ from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.run.folder import RESULT
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.lockstep import CoordinatorParty
-from petrobot.coordinator.run.mission import Mission, Stage
+from petrobot.coordinator.run.mission import UNSCORED, Mission, MissionError, Stage
 from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Task
@@ -143,7 +143,12 @@ class RunSession(ABC):
             with ExitStack() as until_ended:
                 if self.folder is not None and self.address is not None:
                     until_ended.enter_context(published(self.folder, self.address))
-                await self._lead(watch)
+                try:
+                    await self._lead(watch)
+                except MissionError as fault:
+                    if self.mission.stage is not Stage.SCORING:
+                        raise
+                    self._go_unscored(fault)
         except BaseException as fault:
             _log.info("run %s: stopped by %s: %s", self.identity, type(fault).__name__, fault)
             raise
@@ -182,6 +187,12 @@ class RunSession(ABC):
             **self._learned,
             **origin,
         }
+
+    def _go_unscored(self, fault: MissionError) -> None:
+        """Note that the run has finished without its score. The journal has all the rest."""
+        again = f"; `petrobot resume {self.folder}` asks for it again" if self.folder else ""
+        self.mission.remarks[UNSCORED] = f"{fault}{again}"
+        _log.error("run %s: no score: %s", self.identity, fault)
 
     def keep_result(self) -> None:
         """Write the result next to the journal. Raises OSError."""

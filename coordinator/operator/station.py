@@ -31,7 +31,7 @@ from petrobot.coordinator.page.task_store import StoreError, TaskStore, TaskText
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
-from petrobot.coordinator.run.mission import MissionError
+from petrobot.coordinator.run.mission import UNSCORED, MissionError
 from petrobot.coordinator.run.node_status import ask_all
 from petrobot.coordinator.run.realtime import UnreachableError
 from petrobot.coordinator.run.recording import ReplayError
@@ -344,6 +344,8 @@ class Station:
                 await run.lead()
             except MissionError as fault:
                 self._tell_error(str(fault), str(fault))
+            if unscored := run.mission.remarks.get(UNSCORED):
+                self._notice_error(f"no score: {unscored}")
             await asyncio.to_thread(run.keep_result)
             self.feed.emit("result", result=run.result())
         except Exception as fault:  # An exception in a run must not end the station.
@@ -355,6 +357,9 @@ class Station:
 
     def _tell_error(self, reason: str, text: str) -> None:
         self.feed.emit("mission", mission={"state": "error", "reason": reason})
+        self._notice_error(text)
+
+    def _notice_error(self, text: str) -> None:
         notice = {"level": "error", "text": text, "at": self.feed.state["time"]}
         self.feed.emit("notice", notice=notice)
 

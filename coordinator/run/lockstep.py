@@ -15,6 +15,8 @@ NAME = "coordinator"
 PATIENCE = 1800.0
 """Simulated time for which a mission run without an operator waits for an event (s). Nothing tells
 whether the laboratory will raise it, so this must be longer than any button takes."""
+LOOK = 60.0
+"""Simulated time between two checks whether the task can still end (s)."""
 
 
 class _Waiting:
@@ -59,8 +61,9 @@ class CoordinatorParty:
     recorded run is continued).
 
     A mission run that waits for an event longer than `PATIENCE`, and twice the period of each timer
-    of the location file, or that no event can continue, is aborted, unless it is `attended`: an
-    operator may raise the event, or add tokens.
+    of the location file, that no event can continue, or that provably can neither end nor meet a
+    goal any more, is aborted, unless it is `attended`: an operator may raise the event, or add
+    tokens.
     """
 
     def __init__(
@@ -76,6 +79,7 @@ class CoordinatorParty:
         self._directory = directory
         periods = (timer.period for timer in directory.timers.values())
         self._patience = max(PATIENCE, 2.0 * max(periods, default=0.0))
+        self._look = LOOK
         self._waiting = _Waiting(mission.executor.engine)
         mission.executor.observers.append(self._waiting)
         self.watch = watch
@@ -116,9 +120,7 @@ class CoordinatorParty:
                 caller.due()  # keeps `soonest` up to date
             if caller.has_news:
                 mission.take(now, node, caller.notices())
-        since = self._waiting.since
-        if since is not None and (self._waiting.dead or now >= since + self._patience):
-            self._give_up(now)
+        self._abort_if_stuck(now)
         mission.advance(now)
         if mission.stage is Stage.CONNECTING and all(
             caller.up for caller in mission.callers.values()
@@ -127,14 +129,19 @@ class CoordinatorParty:
         if self.watch is not None:
             self.watch(now)
 
-    def _give_up(self, now: float) -> None:
-        executor = self.mission.executor
-        if not self.attended:
+    def _abort_if_stuck(self, now: float) -> None:
+        executor, waiting, why = self.mission.executor, self._waiting, ""
+        engine, chances = executor.engine, True
+        if waiting.since is not None and (waiting.dead or now >= waiting.since + self._patience):
             waited = f"waited {self._patience:.0f} s of simulated time"
-            why = "nothing can happen any more" if self._waiting.dead else waited
-            missing = executor.engine.waiting_for(executor.state)
+            why, waiting.since = "nothing can happen any more" if waiting.dead else waited, None
+        elif now >= self._look:
+            self._look = now + LOOK
+            if not self.attended and not engine.can_end(executor.state):
+                why, chances = "the task can never end, whatever still happens", False
+        if why and not self.attended:
+            missing = engine.stuck_for(executor.state, chances)
             executor.stimulate(now, Abort(f"{why}, and no operator can act: {missing}", stuck=True))
-        self._waiting.since = None
 
     def drain(self) -> Sequence[Envelope]:
         """Return what was sent since the last call, in order."""

@@ -27,7 +27,7 @@ from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
 from petrobot.services.comm.calls.events import STOP_EVENT, RunVerdict
-from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.location_file import MEMORY, Directory, DirectoryError
 from petrobot.services.comm.protocol.messages import (
     SEED,
     Call,
@@ -49,6 +49,8 @@ late. A mission run may last for months."""
 SERVICE_DEADLINE = 20.0
 BAD_VALUE = "bad_value"
 """Key of the engine's report of a result that did not give a value, or one that does not fit."""
+UNSCORED = "unscored"
+"""Key of a result without its score: why there is none."""
 VERDICTS = "verdicts"
 """Key of a score under which it judges runs that ended provisionally: {run: {status, cause,
 text}}."""
@@ -318,6 +320,8 @@ class Mission:
         self.remarks: dict[str, str] = {}
         """Remarks of the shell for the result, for example that the host was too busy."""
         self._early: list[tuple[str, Notice]] = []
+        self._boots: dict[str, str] = {}
+        """By node: its process when it welcomed us last."""
         self._resumed = False
         """Whether an earlier process may have asked for the preparation or the score."""
         task = executor.task.flat
@@ -343,6 +347,7 @@ class Mission:
         if isinstance(step.stimulus, Begin):
             self.begun = now
         self.executor.replay(now, step)
+        self._boots.update(step.boots)
         if self.executor.finished is not None and not self.ended:
             self.ended = now
 
@@ -414,7 +419,7 @@ class Mission:
             "seed": self.executor.seed,
             "runs": self.runs,
             "status": finished.status.value if finished else Status.ERROR.value,
-            "reason": finished.reason if finished else "not finished",
+            "reason": finished.told if finished else "not finished",
             **({"goals": f"{met} {within}"} if has_goal else {}),
             "happened": self.tally.happened(not failed, has_goal and met < wanted),
             **({"last_errors": errors} if errors else {}),
@@ -537,8 +542,21 @@ class Mission:
                 self.lost[node] = notice.reason
             elif isinstance(notice, Welcome):
                 self.lost.pop(node, None)
-                self.executor.store.record(NODE, {"node": node, "boot": split_boot(notice.boot)[0]})
+                process = split_boot(notice.boot)[0]
+                self.executor.store.record(NODE, {"node": node, "boot": process})
+                self._note_lost_memory(now, node, process)
+                self._boots[node] = process
                 self._send_seed(now, node)
+
+    def _note_lost_memory(self, now: float, node: str, process: str) -> None:
+        """Note in the log and the result that the node of the global memory was started again in
+        the middle of the run: its process alone kept the memory."""
+        memory = self.executor.directory.services.get(MEMORY)
+        again = self._boots.get(node, process) != process and self.begun
+        if memory is not None and memory.node == node and again:
+            text = f"{node}, which keeps the global memory, was started again"
+            self.remarks[MEMORY] = f"{text} at {now - self.begun:.1f} s: what it held is lost"
+            _log.warning("%s: what the global memory held is lost", text)
 
     def _send_seed(self, now: float, node: str) -> None:
         """Tell the seed to the devices that no call reaches."""

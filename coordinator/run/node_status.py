@@ -70,6 +70,7 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
         else:
             silent = "connected, but does not answer" if client.answered else "does not answer"
             answer["why"] = refused[-1] if refused else client.trouble or silent
+            answer["refuses"] = client.answered and bool(client.trouble)  # it says why not
     except TimeoutError:
         answer |= {
             "up": False,

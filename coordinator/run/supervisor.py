@@ -243,7 +243,7 @@ async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asy
 async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
     """Write what a program prints to its log, and note when it is ready. If the log cannot be
     written before that, the program is ended; later the program matters more than its log."""
-    said = b""
+    said, told = b"", False
     # Not line by line: a line may be longer than the reader's limit, and if the copying ended then,
     # the pipe would fill and block each later action that prints.
     while part := await output.read(1 << 16):
@@ -256,7 +256,10 @@ async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> 
                 )
                 _signal(child, signal.SIGTERM)
         said = said[1 - len(READY) :] + part  # the word may come in two parts
-        if READY in said and child.log_fault is None:
+        if READY in said and not told and child.log_fault is None:
+            told = True
+            if child.ready.is_set():
+                _log.warning("node %s is ready again", child.program.name)
             child.ready.set()
 
 

@@ -797,3 +797,39 @@ def test_the_result_is_printed_although_an_action_takes_the_output_away(
     assert done.returncode == 0, done.stdout + done.stderr
     assert "status" in done.stdout and "success" in done.stdout
     assert len([*(tmp_path / "runs").glob("*/result.json")]) == 1
+
+
+@pytest.mark.processes
+def test_a_run_without_its_score_has_its_result_and_a_resume_asks_again(tmp_path: Path) -> None:
+    """The node that scores may have died: of such a run, only one line was left."""
+    assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0
+    bot = tmp_path / "bot"
+    task = (bot / "bot.toml").read_text(encoding="utf-8")
+    (bot / "bot.toml").write_text(task.replace("[task]", '[task]\nscore = "tally"', 1), "utf-8")
+    services = (bot / "services.toml").read_text(encoding="utf-8")
+    tally = '[services]\ntally = { node = "pc", run = "bot:tally" }\n[actions]\n'
+    (bot / "services.toml").write_text(services.replace("[actions]\n", tally, 1), "utf-8")
+    code = (bot / "bot.py").read_text(encoding="utf-8")
+    score = """
+
+def tally(ctx: Context, *, cycles: list[Any]) -> Result:
+    from pathlib import Path
+    if not Path("counted").exists():
+        raise OSError("nobody counts")
+    return success(counted=len(cycles))
+"""
+    (bot / "bot.py").write_text(code + score, encoding="utf-8")
+    words = ["--quiet", "--json", "out.json"]
+    run = ["run", "bot/bot.toml", "--mode", "lockstep", "--journal", "runs", *words]
+    done = petrobot(*run, cwd=tmp_path)
+    assert done.returncode == 1, done.stdout + done.stderr
+    first = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
+    assert first["status"] == "success" and "goals" in first and "counted" not in first
+    assert "nobody counts" in first["unscored"] and "petrobot resume " in first["unscored"]
+    assert "unscored" in done.stdout
+    (tmp_path / "counted").touch()
+    done = petrobot("resume", "last", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    again = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
+    assert again["counted"] > 0 and "unscored" not in again
+    assert again["goals"] == first["goals"]

@@ -117,7 +117,20 @@ def test_a_node_that_is_away_has_a_reason(
             frozen.listen()
         command = ["nodes", "--services", str(directory.source), "--timeout", "0.3", "--json", "-"]
         assert main(command) == 3
-    assert why in json.loads(capsys.readouterr().out)["robot"]["why"]
+        told = json.loads(capsys.readouterr().out)["robot"]
+        assert why in told["why"] and not told["refuses"]
+
+
+async def test_a_node_with_another_location_file_is_not_away(
+    directory: Directory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.toml"
+    text = directory.source.read_text(encoding="utf-8")
+    other.write_text(text + "\n[parameters]\nlimits = 'limits.toml'\n", encoding="utf-8")
+    capsys.readouterr()
+    assert await asyncio.to_thread(main, ["nodes", "--services", str(other)]) == 3
+    shown = capsys.readouterr().out
+    assert "refuses us" in shown and "differs" in shown and "away" not in shown
 
 
 def test_the_log_of_a_node_is_printed_by_its_name(

@@ -394,7 +394,7 @@ def test_without_a_run_every_command_says_so(
         "remark": ["seen"],
     }
     assert main([name, *arguments.get(name, []), "--journal", str(tmp_path)]) == 2
-    assert "is active; start one with `petrobot run`" in capsys.readouterr().err
+    assert "start one in real time with `petrobot run`" in capsys.readouterr().err
 
 
 @pytest.mark.processes

@@ -6,6 +6,7 @@ from __future__ import annotations
 from base64 import b64decode
 from typing import Any
 
+from petrobot.coordinator.cli.watch import _snapshot
 from petrobot.services.comm.protocol.messages import Command
 from tests.cli.conftest import Terminal
 
@@ -74,3 +75,11 @@ async def test_old_set_points_are_not_shown(petrobot: Terminal) -> None:
     await petrobot.until(lambda: asked.count("picture") >= 2)
     stop()
     assert feed.state["setpoints"] == {} and feed.state["images"] == {}
+
+
+async def test_a_paused_run_is_shown_as_paused(petrobot: Terminal) -> None:
+    """Its state in the protocol stays `running`; people read the pause beside it."""
+    await petrobot("pause")
+    assert ": paused (by " in _snapshot(petrobot.operation.feed.state)
+    await petrobot("continue")
+    assert ": running; " in _snapshot(petrobot.operation.feed.state)

@@ -382,7 +382,7 @@ def test_what_check_calls_decided_is_never_left_undecided_at_length(
 
 def play_without_operator(task: Task, data: st.DataObject) -> None:
     """Play stimuli of the world only: during a pause, stimuli collect that would otherwise never
-    come together."""
+    come together. What can never end does not end, and never can again."""
     unsettled = any(f.code == "unsettled-conflict" for f in check(task).findings)
     engine = Engine(task, DEVICES, Policy(firing_limit=40))
     journal = Journal(task)
@@ -398,8 +398,12 @@ def play_without_operator(task: Task, data: st.DataObject) -> None:
             VariableChanged("b", False),
             VariableChanged("n", 1),
         ]
+        never = not engine.can_end(state)
         stimulus = data.draw(st.sampled_from(journal.stimuli() + world))
         state, instructions = engine.handle(state, stimulus)
+        ends = [i.reason for i in instructions if isinstance(i, Finished)]
+        assert not (never and any(end.startswith(("final", "given up")) for end in ends))
+        assert not (never and state.mode is Mode.RUNNING and engine.can_end(state))
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -108,6 +108,17 @@ def test_costs_durations_waits_and_values(task: Task) -> None:
     assert selector.learning.question("place").measure == "value:tries"
 
 
+def test_a_trial_says_as_what_a_preempted_run_counts(task: Task) -> None:
+    """Not how its node answered the cancel, which looks like an error of the action."""
+    setting = Setting(task, {}, 40, 1, learner(task, "round_robin", seed=2))
+    cell, party = lockstep_cell(directory(task), setting, scripts())
+    log = TrialLog(task, costs(task, directory(task)))
+    party.mission.executor.observers.append(log)
+    assert cell.run(lambda: party.over, 900_000)
+    texts = {run.text for trial in log.trials for run in trial.runs if run.cancelled}
+    assert texts == {"preempted by jammed, not counted"}
+
+
 def test_a_preempted_run_is_censored_by_its_transition(task: Task) -> None:
     """`jam` comes every 1.24 s and preempts placing runs, which then count no try: exposure grows,
     R does not change."""

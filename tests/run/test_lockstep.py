@@ -121,6 +121,65 @@ def test_it_waits_for_the_timers_of_the_location_file() -> None:
 
 def test_progress_begins_a_new_wait() -> None:
     """Each firing of the task itself, and each run that does not only listen, ends a wait."""
-    again = TASK.replace(PART, TICKED).replace('out = ["counted"]', 'out = ["todo"]')
+    again = TASK.replace(PART, TICKED).replace('out = ["counted"]', 'out = ["todo"]', 1)
     end, _ = led(again, SLOW.replace("35.0", "15.0"))
+    assert end is None
+
+
+CROSSED = """schema = 1
+[task]
+name = "crossed"
+final = "done == 2"
+[primitive_tasks]
+work = { goal = "it is done", alternatives = ["work"], deadline = 2.0 }
+[events]
+tick = { scope = "external" }
+[places]
+one = { tokens = 1, holds = "arm" }
+two = { tokens = 1, holds = "scale" }
+arm = { kind = "resource" }
+scale = { kind = "resource" }
+blinks = { tokens = 1 }
+work = { kind = "action", task = "work" }
+done = { kind = "control" }
+[transitions]
+first = { in = ["one", "scale"], out = ["done", "scale"] }
+second = { in = ["two", "arm"], out = ["done", "arm"] }
+blink = { in = ["blinks"], out = ["work"], event = "tick" }
+blinked = { in = ["work:normal"], out = ["blinks"] }
+dark = { in = ["work:error"], out = ["blinks"] }
+"""
+"""Each part holds what the other needs. Beside them a branch goes on that is not of the task."""
+
+
+def test_a_run_that_can_never_end_is_stuck_although_another_branch_goes_on() -> None:
+    """It once went on for 75,000 s of simulated time without a word."""
+    end, now = led(CROSSED, SLOW.replace("35.0", "5.0"))
+    assert end is not None and end.status is Status.ERROR
+    assert end.reason == (
+        "aborted: the task can never end, whatever still happens, and no operator can act: first "
+        "needs scale, which is empty; second needs arm, which is empty"
+    )
+    assert now < lockstep.LOOK + 1.0
+
+
+@pytest.mark.parametrize(
+    "rescue",
+    [
+        # One error of an action that has never failed would free the arm.
+        'dark = { in = ["work:error"], out = ["blinks", "arm"] }',
+        'dark = { in = ["work:error", "one"], out = ["blinks", "done"] }',
+        'blink_all = { in = ["blinks", "two"], out = ["work", "done"], when = "false" }',
+    ],
+)
+def test_a_run_that_goes_round_but_may_still_end_is_not_cut(rescue: str) -> None:
+    """It may poll for something that comes late."""
+    text = CROSSED.replace('dark = { in = ["work:error"], out = ["blinks"] }', rescue)
+    end, _ = led(text, SLOW.replace("35.0", "5.0"), seconds=5 * lockstep.LOOK)
+    assert end is None
+
+
+def test_with_an_operator_a_run_that_can_never_end_goes_on() -> None:
+    """The operator may add the token."""
+    end, _ = led(CROSSED, SLOW.replace("35.0", "5.0"), attended=True)
     assert end is None

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.engine import Corrected, Engine, Fired, Report, RunRecorded
+from petrobot.coordinator.engine import Corrected, Engine, Finished, Fired, Report, RunRecorded
 from petrobot.coordinator.engine.instructions import Marked, Severity
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.run.mission import Cycle, Mission, MissionError, MissionTally
+from petrobot.coordinator.run.mission import Cycle, Mission, MissionError, MissionTally, Stage
 from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
@@ -84,6 +84,26 @@ def test_a_cycle_without_end_needs_no_more_memory(monkeypatch: pytest.MonkeyPatc
     assert cycle.worst == (Status.ERROR, "slipped", "")
 
 
+@pytest.mark.parametrize(
+    ("reason", "told"),
+    [
+        ("a == 0", "a == 0"),
+        ("(a == 0) and b == 0", "a == 0, and the other plain place is empty"),
+        (
+            "((a == 0) or (b > 1)) and c.begin == 0 and d == 0; x#1 could not be stopped",
+            "(a == 0) or (b > 1), and the other 2 plain places are empty; x#1 could not be stopped",
+        ),
+        ("(a == 0) and (b == 1) and c == 0", "(a == 0) and (b == 1) and c == 0"),
+        ("(a == 0) and b == 1", "(a == 0) and b == 1"),
+    ],
+)
+def test_the_reason_of_the_end_names_what_the_file_says(reason: str, told: str) -> None:
+    """A task with subnets has dozens of plain places, and the reason had twenty lines."""
+    what = "final marking reached: "
+    assert Finished(Status.SUCCESS, what + reason).told == what + told
+    assert Finished(Status.ERROR, "given up: (a == 0)").told == "given up: (a == 0)"
+
+
 def test_four_runs_reach_final(catch_ball: Task) -> None:
     """The initial marking of figure 1 has four run tokens."""
     mission, timeline = run(catch_ball, {})
@@ -97,17 +117,17 @@ def test_four_runs_reach_final(catch_ball: Task) -> None:
 @pytest.mark.parametrize(
     ("status", "text", "told"),
     [
-        (Status.SUCCESS, "by caught", "by caught, which counts as SUCCESS"),
-        (None, "by caught", "by caught, which is not counted"),
+        (Status.SUCCESS, "by caught", "by caught, counted as success"),
+        (None, "by caught", "by caught, not counted"),
         (
             Status.SUCCESS,
             "by caught; it had ended with error, cancelled",
-            "by caught, which counts as SUCCESS",
+            "by caught, counted as success",
         ),
         (
             None,
             "by caught; it had ended with failure, slow",
-            "by caught, which is not counted; its own result came too late: failure, slow",
+            "by caught, not counted; its own result came too late: failure, slow",
         ),
     ],
 )
@@ -259,12 +279,13 @@ def test_the_user_chooses_the_action(catch_ball: Task) -> None:
     assert (track.status, track.cause) == (Status.ERROR, "not_offered")
 
 
-def prepared_mission() -> tuple[Mission, Caller]:
+def prepared_mission(memory: bool = False) -> tuple[Mission, Caller]:
     """Return a mission run that has a preparation and is connected to its node, and its caller."""
     text = TASK.replace('name = "toy"', 'name = "toy"\nprepare = "lab_prepare"')
     places = parse(
         SERVICES.replace("ON_RESUME", "rejoin")
-        + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n',
+        + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n'
+        + '[services.memory]\nnode = "motion"\n' * memory,
         Path("services.toml"),
     )
     caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
@@ -290,6 +311,21 @@ def test_a_stop_before_the_task_has_begun_ends_the_mission_run(prepares: bool, t
         caller.link_up(2.0, m.Welcome(1, "motion", "n1+1"))
     with pytest.raises(MissionError, match="emergency stop, as motion reports: the task was not"):
         mission.take(2.0, "motion", caller.notices())
+
+
+@pytest.mark.parametrize("boot", ["n1", "n2"])
+def test_a_memory_that_was_lost_in_the_run_is_in_the_result(
+    boot: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its node, not a new connection to it, was started again."""
+    mission, caller = prepared_mission(memory=True)
+    mission.begun, mission.stage = 1.0, Stage.RUNNING
+    caller.link_down(4.0, "cut")
+    caller.link_up(5.0, m.Welcome(1, "motion", boot))
+    mission.take(5.0, "motion", caller.notices())
+    lost = "motion, which keeps the global memory, was started again at 4.0 s: what it held is lost"
+    assert mission.result("realtime", 1.0).get("memory") == (lost if boot == "n2" else None)
+    assert ("what the global memory held is lost" in caplog.text) is (boot == "n2")
 
 
 def test_a_repeated_preparation_says_that_it_may_be_one() -> None:

@@ -51,6 +51,10 @@ async def test_a_killed_program_is_restarted_and_all_end_with_the_supervisor(
                 await beat(0.01)
         assert (keeper.starts("a"), keeper.starts("b")) == (2, 1)
         assert keeper.process_ids()["b"] == before["b"]
+        async with asyncio.timeout(60.0):
+            while "node a is ready again" not in caplog.messages:
+                await beat(0.01)
+        assert "node b is ready again" not in caplog.messages
         last = list(keeper.process_ids().values())
     assert not any(map(alive, last))
 

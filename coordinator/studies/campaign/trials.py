@@ -289,7 +289,7 @@ class TrialLog:
         values = self._values.pop(record.run, {})
         entry.status = record.status.value if record.status is not None else ""
         entry.cause = record.cause if record.status is not Status.SUCCESS else ""
-        entry.text, entry.cancelled = record.text, record.cancelled
+        entry.text, entry.cancelled = record.taken_away or record.text, record.cancelled
         entry.judged = not record.deferred
         entry.executed, entry.seconds = record.executed.value, round(record.seconds, DIGITS)
         entry.values = _numbers(values)

@@ -43,8 +43,9 @@ class Patience:
 
     reconnect: float = 2.0
     """For a lost connection to come back, before its calls end."""
-    again: float = 0.1
-    """Between two calls that fail at once because the peer is not there; calls in between wait."""
+    again: float = 5.0
+    """Between two calls that fail at once because the peer is not there; calls in between wait for
+    it. `petrobot up` starts a dead node again within this time, so `tries` reach it."""
     accept: float = 1.0
     """For ACCEPT."""
     stop: float = 5.0
@@ -239,8 +240,8 @@ class PeerAbsence:
     def new_call(self, now: float) -> CallEnd | None:
         """Return how a new call ends at once; None if it waits.
 
-        A call that follows a failed one too soon waits a little: a task that repeats a failed call
-        at once must not loop as fast as the machine can.
+        A call that follows a failed one too soon waits: a task that repeats a failed call at once
+        must not loop as fast as the machine can, nor use up all its tries before the peer is back.
         """
         if now < self.until < NEVER:
             return None
