@@ -171,14 +171,14 @@ def test_a_call_that_was_never_sent_ends_as_not_executed_unless_an_earlier_proce
 @pytest.mark.parametrize("refused", [False, True], ids=["not there", "refuses"])
 def test_a_call_retried_at_once_waits_for_the_peer(refused: bool) -> None:
     """A task that repeats a failed action must not loop as fast as the machine can, nor have no try
-    left when its node is back: at most two calls end in each 5 s."""
+    left when its node is back: at most two calls end in each 2 s."""
     caller, cause = _caller(up=False), "refused" if refused else "unreachable"
     if refused:
         caller.link_refused(0.0, m.Refuse("keys", "copy the key"))
         caller.notices()
     ended: list[float] = []
     now, number = 1.0, 0
-    while now < 51.0:
+    while now < 21.0:
         caller.call(now, m.Call(str(number), "move"))
         if not caller.has_news:
             due = caller.due()

@@ -43,9 +43,10 @@ class Patience:
 
     reconnect: float = 2.0
     """For a lost connection to come back, before its calls end."""
-    again: float = 5.0
+    again: float = 2.0
     """Between two calls that fail at once because the peer is not there; calls in between wait for
-    it. `petrobot up` starts a dead node again within this time, so `tries` reach it."""
+    it. `petrobot up` takes about 2.5 s to start a dead node again: three tries reach it. An action
+    of a node that stays away holds a task up for so long."""
     accept: float = 1.0
     """For ACCEPT."""
     stop: float = 5.0
