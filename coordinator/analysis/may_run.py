@@ -103,7 +103,7 @@ WORDS: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class MayRun:
-    """The answer. `analysis` is None where no search was asked for or the file has errors."""
+    """The answer. `analysis` is None where no search was asked for or the file is inconsistent."""
 
     task: Task
     report: CheckReport
@@ -134,7 +134,7 @@ class MayRun:
 def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) -> MayRun:
     """Judge the task in a cell (None: whether its actions are offered is not examined).
 
-    With a budget the state space is searched as well, if the file has no errors.
+    With a budget the state space is searched as well.
     """
     report = (
         check(task)
@@ -144,7 +144,7 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     if any(finding.code == "inconsistent" for finding in report.errors):
         return MayRun(task, report, None)
     report = CheckReport(in_file(task, (*report.findings, *_late(task))))
-    if budget is None or not report.ok:
+    if budget is None:
         return MayRun(task, report, None)
     analysis = _search(task, budget, devices_of(cell))
     report = CheckReport(in_file(task, _with_graph(report, analysis).findings))
