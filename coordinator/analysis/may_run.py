@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from math import inf
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from petrobot.coordinator.task.check.completeness import (
     external_waits,
     uncovered_exits,
 )
+from petrobot.coordinator.task.check.conflicts import lent
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
 
@@ -166,7 +168,12 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     rest = [f for f in report.findings if f.code not in judged and f not in open_ones]
     may_stay = analysis.progress.may_stay
     rest += external_waits(analysis.progress.x.engine.compiled.task, may_stay=may_stay)
-    found = [_contest(contest) for contest in analysis.progress.contests]
+    flat = analysis.progress.x.engine.compiled.task
+    found = [
+        _contest(contest)
+        for contest in analysis.progress.contests
+        if contest.matters or not _lent(flat, contest)
+    ]
     found += map(_retries, analysis.progress.x.retries)
     found += [_left_behind(p, verdict) for p, verdict in analysis.progress.left_behind.items()]
     if (late := analysis.progress.ends_by_error) is not None:
@@ -234,6 +241,12 @@ def _lost_pulses(x: ExecutionGraph) -> Iterator[Finding]:
 
 def _places(t: Transition) -> set[str]:
     return {a.place for a in t.inputs}
+
+
+def _lent(task: Task, contest: Contest) -> bool:
+    """Whether the transitions only compete for tokens that each gives back at once."""
+    rivals = [task.transitions[name] for name in contest.transitions]
+    return all({*contest.over} <= lent(task, t, u) for t, u in combinations(rivals, 2))
 
 
 def _contest(contest: Contest) -> Finding:

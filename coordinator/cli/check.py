@@ -43,8 +43,6 @@ NO_CELL = "no-cell"
 """Code of the finding that no location file was given."""
 NO_DRY_RUN = "no-dry-run"
 """Code of the finding that drivers of the location file refuse a dry run."""
-NO_EXIT = ("no-normal-exit", "no-error-exit")
-"""Codes of the findings that a place lacks an outgoing transition."""
 PATIENCE = 2.0
 """Seconds that a node has to answer."""
 HANG = 8
@@ -85,15 +83,15 @@ def run(options: argparse.Namespace) -> int:
         cell.faults.append(str(fault))
     faults = [*read.faults, *cell.faults]
     if read.value is None:
-        raise _refused(options.json, task_path(options.task).stem, read, cell.faults)
-    task, analysed = read.value, not read.unknown
+        return _refused(options, task_path(options.task).stem, read, cell.faults)
+    task = read.value
     with told_if_slow("searching the states of the task (Ctrl-C: what is known by now)"):
-        judged, report = _checked(task, cell, code, analysed)
+        judged, report = _checked(task, cell, code, search=not read.faults)
     if not services and not faults:
         report = _noted(report)
-    if not analysed:
+    if read.faults:
         others = [*cell.faults, *_independent(options.task, report, read, cell)]
-        raise _refused(options.json, task.name, read, others)
+        return _refused(options, task.name, read, others)
     report = CheckReport(tuple(f for f in report.findings if cell.is_new(f.key, f.text)))
     missing = _missing(task, services) if options.live and not faults else []
     analysis, ok = judged.analysis, judged.ok and report.ok and not faults
@@ -107,8 +105,6 @@ def run(options: argparse.Namespace) -> int:
         )
     if options.json != "-":
         print("\n".join(_text(options.task, judged, report, missing, faults)))
-    if faults:
-        raise CommandError(2, "\n".join(faults))
     return (
         2
         if not ok
@@ -120,14 +116,25 @@ def run(options: argparse.Namespace) -> int:
     )
 
 
-def _refused(json: str | None, task: str, read: FaultyFile[Task], more: list[str]) -> CommandError:
-    """Return the refusal of a task whose net was not judged, and write its JSON. `more`: what else
-    is wrong."""
+def _refused(
+    options: argparse.Namespace, task: str, read: FaultyFile[Task], more: list[str]
+) -> int:
+    """Say what is wrong in a task file whose net was not searched, also as JSON; return the exit
+    code. `more`: what else is wrong."""
     faults = [*read.faults, *more]
-    if json:
+    if options.json:
         findings = [_plain_fault(line, read.source) for line in faults]
-        write_json(json, {"task": task, "ok": False, "findings": findings})
-    return CommandError(2, "\n".join(faults))
+        write_json(options.json, {"task": task, "ok": False, "findings": findings})
+    if options.json != "-":
+        told = [str(Told(Severity.ERROR, line)) for line in faults]
+        print("\n".join([_because_of(options.task, faults), "", *told]))
+    return 2
+
+
+def _because_of(name: str, faults: list[str]) -> str:
+    """Return the first line of an answer: which file keeps the task from running."""
+    code = re.search(r"\((\S+\.py:\d+)\)", faults[0])  # where a module cannot be imported
+    return f"{name}: may not run because of {code[1] if code else faults[0].partition(':')[0]}"
 
 
 def _plain_fault(line: str, source: str) -> dict[str, Any]:
@@ -190,19 +197,23 @@ def _read_cell(
 
 
 def _checked(
-    task: Task, cell: FaultyFile[Directory], code: Mapping[str, Facts], search: bool
+    task: Task, cell: FaultyFile[Directory], code: Mapping[str, Facts], *, search: bool
 ) -> tuple[MayRun, CheckReport]:
-    """Return the judgement of the task in a cell, and its findings with those about the code."""
+    """Return the judgement of the task in a cell, and its findings with those about the code. Its
+    states are searched where it has no other error: that takes seconds."""
     from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 
-    budget = BUDGET if search else None
-    if cell.value is None:
-        judged = may_run(task, None, budget)
-        return judged, judged.report
-    judged = may_run(task, cell_of(cell.value), budget)
-    if search and not cell.faults:
-        objections(task, cell_of(cell.value), judged)  # so that `run` need not search again
-    return judged, _with_code(task, cell.value, code, judged)
+    own = None if cell.value is None else cell_of(cell.value)
+    for budget in (None, BUDGET) if search else (None,):
+        judged = may_run(task, own, budget)
+        report = judged.report
+        if cell.value is not None:
+            report = _with_code(task, cell.value, code, judged)
+        if not report.ok:
+            break
+    if judged.analysis is not None and own is not None and not cell.faults:
+        objections(task, own, judged)  # so that `run` need not search again
+    return judged, report
 
 
 def _independent(
@@ -369,8 +380,6 @@ def _told(report: CheckReport, name: str) -> Iterator[Told]:
     shown = path.name if str(path) != name else name  # that of a shipped task is long
     notes = Counter(f.code for f in report.findings if f.severity is Severity.NOTE)
     for finding, line in zip(report.findings, _lines(report, name), strict=True):
-        if finding.code == "left-behind" and _follows(finding.key, report):
-            continue
         place = f"{shown}:{line}: " if line else ""
         details = [finding.remedy, *finding.details] if finding.remedy else [*finding.details]
         if finding.severity is Severity.NOTE:
@@ -422,10 +431,11 @@ def _text(
     from petrobot.coordinator.analysis.may_run import LATE
 
     analysis, told = judged.analysis, list(_told(report, name))
-    if missing or faults or not (judged.ok and report.ok):
-        held = analysis is not None and not analysis.objections
+    if faults:
+        yield _because_of(name, faults)
+    elif missing or not (judged.ok and report.ok):
+        held = analysis is None or not analysis.objections
         why = next((f.key for f in report.errors), "a missing node")
-        why = faults[0].partition(":")[0] if faults else why
         yield wrapped(f"{name}: may not run{f' because of {why}' if held else ''}", 2)
     elif analysis is not None and analysis.interrupted:
         yield f"{name}: was not checked to its end (Ctrl-C)"
@@ -438,11 +448,12 @@ def _text(
         but = [f"{part} was proved"] if open_ else []
         but += [f"runs take longer than {listed([*late])} on average"] if late else []
         yield wrapped(f"{name}: may run{f', but {listed(but)}' if but else ''}", 2)
-    if analysis is not None:
+    if faults:  # they come first; of the rest, only what is wrong whatever they are
+        told = [one for one in told if one.severity is not Severity.NOTE]
+        told = [*(Told(Severity.ERROR, line) for line in faults), *told]
+    if analysis is not None and (analysis.objections or not faults):
         yield from _summary(analysis)
-        for one in _reasons(analysis):
-            if not _follows(" ".join([one.text, *one.details[:1]]), report):
-                told.append(one)
+        told += _reasons(analysis)
         told += _notes(name, analysis)
     if missing or told:
         yield ""
@@ -451,12 +462,6 @@ def _text(
     yield from map(str, sorted(told, key=lambda one: order.index(one.severity)))
     if analysis is not None and analysis.objections:
         yield f"petrobot analyse {name} --pictures FOLDER draws how it comes to that"
-
-
-def _follows(reason: str, report: CheckReport) -> bool:
-    """Return whether a verdict fails at a place without an exit, which is reported on its own."""
-    missing = {f.key.rpartition(".")[2] for f in report.errors if f.code in NO_EXIT}
-    return not missing.isdisjoint(re.findall(r"\w+", reason))
 
 
 def _summary(analysis: Analysis) -> list[str]:

@@ -6,6 +6,7 @@ fires by these tables and the forecast plays by them (docs/semantics.md, section
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from petrobot.coordinator.task.conditions import Expression
@@ -154,12 +155,26 @@ def endless(task: Task) -> set[str]:
     which no other of them fills, or that fill a place which inhibits them and which no other of
     them drains: they can fire only finitely often. What none of them changes stays as it is, so
     they are judged once with those that need k tokens there, and once with those that k tokens
-    inhibit. The others may fire for ever.
+    inhibit; of two places whose sum no firing changes, such as `open` and `closed`, each says what
+    the other holds. The others may fire for ever.
     """
     net = task.net
     changes = dict(zip(net.transitions, net.compiled.changes, strict=True))
     needs = dict(zip(net.transitions, map(dict, net.compiled.needs), strict=True))
     barred = dict(zip(net.transitions, map(dict, net.inhibit), strict=True))
+
+    effects = {p.name: dict[str, int]() for p in task.places.values() if p.kind is not Kind.CONTROL}
+    for t, changed in changes.items():
+        for p, change in changed:
+            if (name := net.places[p]) in effects:  # a control place is the operator's
+                effects[name][t] = change
+
+    def partners(p: int) -> Iterator[tuple[int, int]]:
+        """Yield the places that hold what this one lacks of a sum, with that sum."""
+        gone = {t: -change for t, change in effects.get(net.places[p], {}).items()}
+        for q, name in enumerate(net.places) if gone else ():
+            if effects.get(name) == gone:
+                yield q, net.initial[p] + net.initial[q]
 
     def repeatable(loose: set[str]) -> set[str]:
         while True:
@@ -182,6 +197,9 @@ def endless(task: Task) -> set[str]:
             if place not in changed:
                 few = {t for t in loose if needs[t].get(place, 0) < k}
                 many = {t for t in loose if barred[t].get(place, k + 1) > k}
+                for other, total in partners(place):
+                    few -= {t for t in few if barred[t].get(other, total + 1) <= total - k + 1}
+                    many -= {t for t in many if needs[t].get(other, 0) > total - k}
                 if (rest := repeatable(few) | repeatable(many)) < loose:
                     return rest
         return loose

@@ -16,7 +16,7 @@ from petrobot.coordinator.analysis.execution.causes import explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
 from petrobot.coordinator.analysis.execution.names import Names
-from petrobot.coordinator.analysis.execution.progress import progress_of
+from petrobot.coordinator.analysis.execution.progress import Progress, progress_of
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.time.measured import NoEstimate
 from petrobot.coordinator.engine import (
@@ -431,10 +431,9 @@ def reached(first: int, after: list[set[int]]) -> set[int]:
     return known
 
 
-@pytest.mark.once
-@settings(COMMON, max_examples=60)
-@given(whole_tasks(), st.data())
-def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataObject) -> None:
+def with_ends(task: Task, data: st.DataObject) -> Task:
+    """Return the task with an end of each kind, a transition that forgets its tokens and a stop
+    button."""
     kept = [p.name for p in task.places.values() if p.kind in (Kind.CONTROL, Kind.RESOURCE)]
     assume(kept)
     draw = data.draw
@@ -446,6 +445,14 @@ def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataO
     task = replace(moved(task, transitions=[forgets]), final=first, final_error=second)
     task = with_button(task, draw(st.sampled_from(kept)))
     assume(not faults(task))
+    return task
+
+
+@pytest.mark.once
+@settings(COMMON, max_examples=60)
+@given(whole_tasks(), st.data())
+def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataObject) -> None:
+    task = with_ends(task, data)
     try:
         found = progress_of(OrdinaryView(task), 300)
     except TooManyValues:
@@ -457,6 +464,42 @@ def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataO
     assert found.sound.holds is (everywhere and once)
     if not everywhere and not x.dead.any() and not x.livelocks:
         assert found.sound.witness is not None and found.sound.details
+
+
+def partial_refutes_only_what_fails(task: Task, data: st.DataObject) -> None:
+    task = with_ends(task, data)
+    view, engine = OrdinaryView(task), Engine(task, policy=Policy(firing_limit=40))
+    try:
+        whole = Progress(execute(task, limit=1_000, engine=engine), view)
+        assume(whole.x.complete and len(whole.x) > 10)
+        limit = data.draw(st.integers(8, len(whole.x.source) // 2))
+        part = Progress(execute(task, limit=limit, engine=engine), view)
+    except TooManyValues:
+        assume(False)
+    assume(not part.x.complete)
+    known = whole.verdicts()
+    refuted = {name for name, verdict in part.verdicts().items() if verdict.holds is False}
+    event(f"refuted: {sorted(refuted)}")
+    assert all(known[name].holds is False for name in refuted), refuted
+    for i in np.flatnonzero(part.x.dead).tolist():
+        state = part.x.engine.initial()
+        for stimulus in part.x.stimuli(i):
+            state, _ = part.x.engine.handle(state, stimulus)
+        assert state == part.x.states[i]
+
+
+@pytest.mark.once
+@settings(COMMON, max_examples=60)
+@given(whole_tasks(), st.data())
+def test_a_part_of_the_graph_refutes_only_what_fails(task: Task, data: st.DataObject) -> None:
+    partial_refutes_only_what_fails(task, data)
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=5000)
+@given(whole_tasks(), st.data())
+def test_a_part_refutes_only_what_fails_at_length(task: Task, data: st.DataObject) -> None:
+    partial_refutes_only_what_fails(task, data)
 
 
 ESTIMATES = {

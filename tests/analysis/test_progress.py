@@ -13,6 +13,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.execution import graph
 from petrobot.coordinator.analysis.execution.chain import chain_of
 from petrobot.coordinator.analysis.execution.graph import MOVES, execute, in_words, with_operator
 from petrobot.coordinator.analysis.execution.progress import MENDED, NAMES, Progress, progress_of
@@ -1546,3 +1547,82 @@ def test_a_resource_that_an_ended_run_keeps_is_told_with_what_that_run_lacks() -
     verdict = judged(task).returned
     assert verdict.holds is False
     assert "look has ended: seen needs cup, which is empty" in verdict.details
+
+
+def crossed(steps: int, door: bool) -> Task:
+    """Return a task of two arms that each make some steps, then take two tools in opposite order.
+    Beside them a door opens and closes for ever, or three lamps shine a few times."""
+    text = """schema = 1
+[task]
+name = "crossed"
+final = "left == 1 and right == 1"
+final_error = "broken > 0"
+[errors]
+to = "broken"
+[primitive_tasks]
+move = { goal = "it is there", deadline = 5.0 }
+[events]
+opens = { memory = "latched", early = "keep" }
+closes = { memory = "latched", early = "keep" }
+[places]
+left = {}
+right = {}
+broken = {}
+pen = { kind = "resource", tokens = 1 }
+knife = { kind = "resource", tokens = 1 }
+shut = { tokens = 1, listen = true }
+open = { listen = true }
+"""
+    places, arcs = list[str](), list[str]()
+    for arm, first, second in (("left", "pen", "knife"), ("right", "knife", "pen")):
+        places.append(f"{arm}_ready = {{ tokens = 1 }}")
+        places += [f'{arm}{n} = {{ kind = "action", task = "move" }}' for n in range(steps + 2)]
+        arcs.append(f'{arm}_go = {{ in = ["{arm}_ready"], out = ["{arm}0"] }}')
+        for n in range(steps + 1):
+            tool = {steps - 1: f', "{first}"', steps: f', "{second}"'}.get(n, "")
+            arcs.append(f'{arm}_{n} = {{ in = ["{arm}{n}:normal"{tool}], out = ["{arm}{n + 1}"] }}')
+        given = f'["{arm}", "pen", "knife"]'
+        arcs.append(f'{arm}_end = {{ in = ["{arm}{steps + 1}:normal"], out = {given} }}')
+    if door:
+        arcs.append('opened = { in = ["shut"], out = ["open"], event = "opens" }')
+        arcs.append('closed = { in = ["open"], out = ["shut"], event = "closes" }')
+    for lamp in () if door else ("red", "green", "blue"):
+        places.append(f"{lamp}_left = {{ tokens = 4 }}")
+        places.append(f'{lamp} = {{ kind = "action", task = "move" }}')
+        arcs.append(f'{lamp}_on = {{ in = ["{lamp}_left", "!{lamp}"], out = ["{lamp}"] }}')
+        arcs.append(f'{lamp}_off = {{ in = ["{lamp}:normal"] }}')
+    return loads("\n".join([text, *places, "[transitions]", *arcs, ""]))
+
+
+@pytest.mark.parametrize(
+    ("door", "steps", "limit", "refuted"),
+    [(True, 12, 9_000, {"sound"}), (False, 4, 20_000, {"sound", "deadlock_free"})],
+)
+def test_a_dead_end_far_from_the_beginning_is_found_by_random_plays(
+    door: bool,
+    steps: int,
+    limit: int,
+    refuted: set[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Breadth first, the other branch swells the graph, so that its limit is reached long before.
+    With the door the arms are stuck, while it can go on for ever: not a dead end of the graph."""
+    view = OrdinaryView(crossed(steps, door))
+    found = progress_of(view, limit)
+    assert not found.x.complete
+    assert {name for name, v in found.verdicts().items() if v.holds is False} == refuted
+    verdict = found.sound if door else found.deadlock_free
+    witness = verdict.witness
+    assert witness is not None
+    assert {"pen", "knife"}.isdisjoint(witness.marking)
+    told = " ".join((verdict.reason, *verdict.details))
+    assert "needs knife, which is empty" in told and "needs pen, which is empty" in told
+    state = next(i for i in range(len(found.x)) if found.x.marked(i) == witness.marking)
+    after = found.x.engine.initial()
+    for stimulus in found.x.stimuli(state):
+        after, _ = found.x.engine.handle(after, stimulus)
+    assert after == found.x.states[state]
+    again = progress_of(view, limit)
+    assert (again.x.states, again.x.steps) == (found.x.states, found.x.steps)
+    monkeypatch.setattr(graph, "PLAYS", limit + 1)  # so that there are none
+    assert progress_of(view, limit).sound.holds is None

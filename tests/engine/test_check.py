@@ -17,6 +17,12 @@ from tests.effort import calls
 
 Tasks = Callable[..., Task]
 A = {"n": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error", "out": "y"}}
+DOOR = {
+    "t": {"in": "x !open", "out": "a"},
+    "u": {"in": "a:preempt=none !shut", "out": "x"},
+    "opens": {"in": "shut", "out": "open", "after": 1.0},
+    "shuts": {"in": "open", "out": "shut", "after": 1.0},
+}
 E, W, N = Severity.ERROR, Severity.WARNING, Severity.NOTE
 
 
@@ -338,12 +344,57 @@ def test_invariant_that_excludes_two_transitions(
             "x=1 a! lid",
             {"t": {"in": "x !lid", "out": "a"}, "u": {"in": "a:preempt=none lid", "out": "x lid"}},
         ),
+        ("x=1 a! shut~=1 open~", DOOR),  # one of the two always bars
     ],
 )
 def test_a_loop_that_counts_or_bars_itself_is_no_timeless_cycle(
     places: str, net: dict[str, Any], task: Tasks
 ) -> None:
     assert "timeless-cycle" not in found(task(places, net))
+
+
+@pytest.mark.parametrize(
+    ("places", "more"),
+    [
+        ("x=1 a! shut=1 open", {}),  # the operator may empty both
+        ("x=1 a! shut~ open~", {}),
+        ("x=1 a! shut~=1 open~", {"lost": {"in": "open", "after": 1.0}}),
+    ],
+)
+def test_a_loop_that_two_empty_places_permit_is_a_timeless_cycle(
+    places: str, more: dict[str, Any], task: Tasks
+) -> None:
+    assert "timeless-cycle" in found(task(places, {**DOOR, **more}))
+
+
+@pytest.mark.parametrize(
+    ("change", "competes"),
+    [
+        ({}, False),
+        ({"t": {"in": "x p", "out": "p*2"}}, False),
+        ({"t": {"in": "x p"}}, True),
+        ({"t": {"in": "x p*2", "out": "p"}}, True),
+        ({"t": {"in": "x p", "out": "p z"}, "u": {"in": "y p !z", "out": "p"}}, True),
+        *(  # the event is lost if the other is first
+            (
+                {
+                    "t": {"in": "x p", "out": "p", "event": event},
+                    "u": {"in": "y p", "out": "p", "event": event},
+                },
+                True,
+            )
+            for event in "ed"
+        ),
+        ({"t": {"in": "x p", "out": "p", "event": "k"}}, False),
+    ],
+)
+def test_transitions_that_give_back_what_they_take_do_not_compete(
+    change: dict[str, Any], competes: bool, task: Tasks
+) -> None:
+    """Unless the one that is first keeps the other from firing just after it."""
+    net = {"t": {"in": "x p", "out": "p"}, "u": {"in": "y p", "out": "p"}, **change}
+    codes = found(task("x~=1 y~=1 p~=2 z~", net, "e d* k+"))
+    assert ("unsettled-conflict" in codes) == competes, codes
 
 
 def test_places_that_wait_together_are_one_finding(task: Tasks) -> None:

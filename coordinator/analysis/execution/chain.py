@@ -562,7 +562,7 @@ class _Builder:
         x, state = self.x, self.x.states[i]
         slots = self.slots(state)
         number = {slot: k for k, slot in enumerate(slots)}
-        ended = i >= x.expanded or i in x.livelocks
+        ended = not x.expanded[i] or i in x.livelocks
         stimuli = () if ended else x.names.stimuli(state, x.orders[i])
         made = [(cause, self.outcome(i, cause, number)) for cause in stimuli]
         if first := self.at_once(state, made):

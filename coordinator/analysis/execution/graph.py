@@ -6,13 +6,18 @@ rule. Two engine states are one state of X if all parts on which the future depe
 (`names.py`). States are numbered in breadth-first order, 0 is the state after `Begin`, so the path
 to a state is shortest. The first engine state found represents all equal ones; so the engine can
 replay each path along the search tree exactly.
+
+A graph that is too large is continued by random plays: they go deep where breadth first stays near
+the beginning, so that a dead end far away is found.
 """
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +60,15 @@ MOVES = 3
 up and added again, so without this nearly every search would reach its limit."""
 BETWEEN = 1_000
 """Stimuli and firings between two looks at the clock."""
+PLAYS = 4
+"""Of a graph that is too large, random plays follow a fourth as many stimuli and firings more."""
+SHORTEST, LENGTHS = 32, 6
+"""The lengths of plays, in turn: this one, then twice as long, so many times."""
+RARE, KNOWN = 1e-6, 0.5
+"""How likely a play takes an ERROR if it is careful, as each second one is, and a state that was
+explored before. Errors often end a mission, and then nothing deeper is seen."""
+STALE = 16
+"""After so many steps without a new state, a play goes on at the nearest one."""
 QUEUE = 16
 """So many runs of a state count like one more firing. Else a queue that a timer fills for ever
 reaches thousands of runs, and each stimulus takes as long."""
@@ -107,8 +121,8 @@ class Step:
 
 @dataclass(frozen=True)
 class ExecutionGraph:
-    """The states found and their edges. If the search stopped early, only the first `expanded`
-    states have their edges, `complete` is False and `reason` says why."""
+    """The states found and their edges. If the search stopped early, only the states in `expanded`
+    have their edges, `complete` is False and `reason` says why."""
 
     engine: Engine
     names: Names
@@ -124,7 +138,7 @@ class ExecutionGraph:
     steps: tuple[Step, ...]
     first: tuple[str, ...]
     """Transitions that fire at `Begin`, before any stimulus."""
-    expanded: int
+    expanded: Mask
     complete: bool
     reason: str
     livelocks: tuple[int, ...]
@@ -211,12 +225,12 @@ class ExecutionGraph:
         without the operator."""
         alive = self.final | self.given_up
         alive[self.source[self.fires & ~self.by_hand]] = True
-        alive[self.expanded :] = True  # its edges were not explored
+        alive |= ~self.expanded  # its edges were not explored
         return ~self.graph.backward(alive, ~self.by_hand)
 
     def path(self, state: int) -> list[Step]:
         """Return the path along which the state was found: a shortest one from the beginning, with
-        as few commands of the operator as possible."""
+        as few commands of the operator as possible, if no random play found it."""
         found = list[Step]()
         while (came := self.came[state]) is not None:
             first = int(self.graph.row[came[0]])
@@ -376,8 +390,10 @@ class _Search:
         begun = self.engine.initial()
         state, said = self.engine.handle(begun, Begin())
         self._found(begun, frozenset(), state, said, None)
-        i = self._explore(0, limit)
-        return self._result(_fired(said), i, np.zeros(len(self.edges[0]), np.bool_), limit)
+        known = self._explore(0, limit)
+        expanded = self._play(known, limit + limit // PLAYS)
+        by_hand = np.zeros(len(self.edges[0]), np.bool_)
+        return self._result(_fired(said), expanded, by_hand, limit)
 
     def with_operator(self, x: ExecutionGraph, limit: int) -> ExecutionGraph:
         """Explore what the operator's commands add."""
@@ -393,7 +409,7 @@ class _Search:
             by_hand += [True] * (len(self.edges[0]) - len(by_hand))
             begin, end = end, self._explore(end, limit)
             by_hand += [False] * (len(self.edges[0]) - len(by_hand))
-            found = self._result(x.first, end, np.array(by_hand, np.bool_), limit)
+            found = self._result(x.first, range(end), np.array(by_hand, np.bool_), limit)
             if found.dead[len(x) :].any() or len(found.contests) > len(x.contests):
                 break
         return replace(found, complete=found.complete and self.handled < limit and not self.late)
@@ -403,13 +419,61 @@ class _Search:
         explored."""
         looked = self.handled
         while i < len(self.states) and self.handled < limit and not self.late:
-            state = self.states[i]
-            number = self.shared.number(self.names.core(state, self.orders[i]), state)
-            self._follow(i, self._causes(i), self.shared.after.setdefault(number, []))
+            self._expand(i)
             i += 1
             if self.handled - looked >= BETWEEN:
                 looked, self.late = self.handled, overtime()
         return i
+
+    def _play(self, known: int, limit: int) -> Iterable[int]:
+        """Play from the first state at random, the same way each time, and follow all stimuli of
+        the states that the plays come through. Return the states whose edges are there; before,
+        those are the first `known`."""
+        source, target, label = self.edges
+        rows = np.searchsorted(source, range(known + 1)).tolist()
+        edges = {i: range(rows[i], rows[i + 1]) for i in range(known)}
+        random, careful = np.random.Generator(np.random.PCG64(0)), False
+        lengths = cycle(SHORTEST << n for n in range(LENGTHS))
+        while len(edges) < len(self.states) and self.handled < limit and not self.late:
+            i, stale, careful = 0, 0, not careful
+            for _ in range(next(lengths)):
+                self.handled += 1
+                if i not in edges:
+                    begin = len(target)
+                    self._expand(i)
+                    edges[i] = range(begin, len(target))
+                ways = [e for e in edges[i] if target[e] != i]
+                if stale >= STALE and all(target[e] in edges for e in ways):
+                    # Else a part that the task never leaves would hardly be explored to its end.
+                    if (i := self._nearest(i, edges)) < 0:
+                        break
+                    continue
+                if not ways:
+                    break
+                shares = list[float]()
+                for e in ways:
+                    avoided = careful and self.steps[label[e]].fails
+                    share = (RARE if avoided else 1.0) * (KNOWN if target[e] in edges else 1.0)
+                    shares.append(share + (shares[-1] if shares else 0.0))
+                way = bisect(shares, random.random() * shares[-1], hi=len(ways) - 1)
+                i = target[ways[way]]
+                stale = stale + 1 if i in edges else 0
+            self.late = overtime()
+        return edges
+
+    def _nearest(self, i: int, edges: Mapping[int, Iterable[int]]) -> int:
+        """Return the nearest state after this one whose edges are not there; -1 if there is none:
+        nothing else can be reached."""
+        target, seen = self.edges[1], {i: None}
+        for state in (todo := [i]):
+            self.handled += 1
+            for e in edges[state]:
+                if (j := target[e]) not in edges:
+                    return j
+                if j not in seen:
+                    seen[j] = None
+                    todo.append(j)
+        return -1
 
     def _follow(
         self, i: int, causes: Iterable[Cause], known: list[NextState | None] | None
@@ -467,9 +531,11 @@ class _Search:
         return self.index.get((found.number, waiting, left, False))
 
     def _result(
-        self, first: tuple[str, ...], expanded: int, by_hand: Mask, limit: int
+        self, first: tuple[str, ...], expanded: Iterable[int], by_hand: Mask, limit: int
     ) -> ExecutionGraph:
-        complete = expanded == len(self.states)
+        done = np.zeros(len(self.states), np.bool_)
+        done[list(expanded)] = True
+        complete = bool(done.all())
         source, target, label = (np.array(row, dtype=np.int32) for row in self.edges)
         order = np.argsort(source, kind="stable")
         return ExecutionGraph(
@@ -483,7 +549,7 @@ class _Search:
             label[order],
             tuple(self.steps),
             first,
-            expanded,
+            done,
             complete,
             ""
             if complete
@@ -498,8 +564,12 @@ class _Search:
             by_hand[order],
         )
 
-    def _causes(self, i: int) -> Iterable[Cause]:
-        return () if i in self.livelocks else self.names.stimuli(self.states[i], self.orders[i])
+    def _expand(self, i: int) -> None:
+        """Follow all stimuli of the world from a state."""
+        state, orders = self.states[i], self.orders[i]
+        number = self.shared.number(self.names.core(state, orders), state)
+        causes = () if i in self.livelocks else self.names.stimuli(state, orders)
+        self._follow(i, causes, self.shared.after.setdefault(number, []))
 
     def _found(
         self,

@@ -232,7 +232,7 @@ class Progress:
                 stuck.setdefault((*commands, *(p for p in x.marked(i) if p not in control)), i)
         found += [_stuck(x, i) for i in list(stuck.values())[:GROUPS]]
         if not found and not x.complete:
-            text = f"nothing found in {x.expanded} states; the search was not completed"
+            text = f"nothing found in {x.expanded.sum()} states; the search was not completed"
             found = [PropertyVerdict(None, text, complete=False)]
         return found
 
@@ -277,8 +277,7 @@ class Progress:
         calm = x.of_edges(~x.fails & ~x.firing(self._stops))
         hopeless = f"the task can only give up: it never comes to {final}"
         only_gives_up = x.complete and not x.final.any() and tired.all()
-        good = x.final.copy()
-        good[x.expanded :] = True
+        good = x.final | ~x.expanded
         lost = np.flatnonzero(~(x.graph.backward(good) | calm.backward(x.given_up)))
         if not len(lost) and only_gives_up:
             return self._no(hopeless, int(np.flatnonzero(x.given_up)[0]))
@@ -329,18 +328,18 @@ class Progress:
         and has met no error, such as a stop button.
 
         After them `final` cannot be reached, or not before another event comes, such as the one
-        that resets the button; or all that they ever bring is `final_error`.
+        that resets the button; or all that they ever bring is `final_error`. In a graph that is not
+        complete, only those that are stops whatever its missing edges show.
         """
         x, known = self.x, self.x.engine.compiled
         awaiting = {t.name: {*t.flags, t.pulse} for t in known.transitions if t.flags or t.pulse}
-        good = x.final.copy()
-        good[x.expanded :] = True
-        can = x.graph.backward(good)
+        good, can = x.final | ~x.expanded, x.graph.backward(x.final)
+        lost = ~x.graph.backward(good)
         marks, found, free = self._marks(awaiting), set[str](), (self._nominal & can)[x.source]
         for n in np.unique(x.label[free]).tolist():
             found |= marks.intersection(x.steps[n].firings)
         # After a run that ended in ERROR, an event that was kept may be served in the same step.
-        for n in np.unique(x.label[free & ~x.fails & ~can[x.target]]).tolist():
+        for n in np.unique(x.label[free & ~x.fails & lost[x.target]]).tolist():
             cause = x.steps[n].stimulus
             came = cause.event if isinstance(cause, EventOccurred) else None
             fired = x.steps[n].firings
@@ -349,11 +348,12 @@ class Progress:
         events = x.firing(awaiting)
         quiet = x.of_edges(~x.fails & ~events)
         doomed = quiet.backward(x.given_up) & ~quiet.backward(good)
-        into = free & events & ~x.fails & ~doomed[x.source] & doomed[x.target]
+        able = quiet.backward(x.final) | ~quiet.backward(x.given_up | ~x.expanded)
+        into = free & events & ~x.fails & able[x.source] & doomed[x.target]
         fired = (set(x.steps[n].firings) for n in np.unique(x.label[into]).tolist())
         maybe = set[str]().union(*fired) & set(awaiting)
         # Those that `final` needs anyhow are no stops.
-        spared = x.of_edges(~x.firing(maybe)).backward(good)[x.source]
+        spared = x.of_edges(~x.firing(maybe)).backward(x.final)[x.source]
         return frozenset(found | {t for t in maybe if (into & spared & x.firing([t])).any()})
 
     def _marks(self, awaiting: Iterable[str]) -> set[str]:

@@ -95,7 +95,9 @@ class Structure:
         for place in flat.places.values():
             if place.kind is Kind.ACTION and place.most_active > 1:
                 raise ValueError(
-                    f"places.{place.name}: forecasts know one run at a time; give it servers = 1"
+                    f"places.{place.name}: it has servers = {place.most_active}, but a forecast "
+                    "plays one run of a place at a time; forecast a copy of the task with "
+                    "servers = 1 there, where further runs wait, or run a campaign of the task"
                 )
         for t in flat.transitions.values():
             _refuse_unknown_preemption(t)

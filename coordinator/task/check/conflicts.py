@@ -173,9 +173,29 @@ def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
         for b in u.inputs
         if a.place == b.place and _same_token(task, t, a, u, b)
     }
+    shared -= lent(task, t, u)
     common = [task.events[e] for e in t.events if e in u.events]
     events = {f"the event {e.name}" for e in common if not is_pulse(e)}
     return shared | events | _mutual_bars(t, u) | (_room(task, t) & _room(task, u))
+
+
+def lent(task: Task, t: Transition, u: Transition) -> set[str]:
+    """Return the places to which both give back what they take, so that the second fires just after
+    the first; none if the first could keep it from that in another way."""
+    for one, other in ((t, u), (u, t)):
+        waits = [task.events[e] for e in other.events]
+        if any(is_pulse(e) or _holds_until_fired(task, e.name) for e in waits):
+            return set()  # the event is lost between the two firings
+        if {o.place for o in one.outputs} & {i.place for i in other.inhibitors}:
+            return set()
+        if other.when is not None and other.when.names & {name for name, _ in one.sets}:
+            return set()
+    return _given_back(t) & _given_back(u)
+
+
+def _given_back(t: Transition) -> set[str]:
+    given = {o.place: o.weight for o in t.outputs}
+    return {a.place for a in t.inputs if a.end is None and a.weight <= given.get(a.place, 0)}
 
 
 def _room(task: Task, t: Transition) -> set[str]:

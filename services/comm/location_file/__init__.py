@@ -470,8 +470,10 @@ def resolve(path: str) -> Any:
     except KeyboardInterrupt:
         raise
     except BaseException as fault:  # a module may call sys.exit, and its exceptions may be broken
-        words = traceback.TracebackException(type(fault), fault, None)  # also if `str` raises
-        text = f"importing {written!r} raises {type(fault).__name__}: {words}{_at(fault)}"
+        words, at = f"{traceback.TracebackException(type(fault), fault, None)}", _at(fault)
+        if isinstance(fault, SyntaxError) and fault.filename:  # no line of it was executed
+            words, at = fault.msg, f" ({Path(fault.filename).name}:{fault.lineno})"
+        text = f"importing {written!r} raises {type(fault).__name__}: {words}{at}"
         raise ImportError(f"{text}; correct the module") from fault
     found = getattr(module, attribute, None)
     if not callable(found):
