@@ -651,6 +651,8 @@ def _analyse_task(
             except TooManyValues as fault:
                 why = str(fault)
             if progress is None or not progress.x.complete:
+                if progress is not None:
+                    progress.verdicts()  # what it refutes, before proofs use up the time
                 shown = proven(n, found.space, ordinary)
     except KeyboardInterrupt:
         notes.append(CUT)
