@@ -241,9 +241,7 @@ async def _follow(
     as the driver reports.
 
     `recovery` is the run that found the line, if it is to be judged: a line that is followed to an
-    end that was announced belongs to the track, one that ceases does not. The value `recovery` is
-    the run that is still to be judged, empty after its verdict: a later stretch gives no second
-    one.
+    end that was announced belongs to the track, one that ceases does not.
     """
     drive = _Drive(ctx, law, speed, timeout)
     begun, way = ctx.now, ctx.device.state["way"]
@@ -279,23 +277,20 @@ async def _follow(
         raise
     if recovery and result.status is Status.SUCCESS:
         ctx.verdict(recovery, Status.SUCCESS)
-        recovery = ""
     elif recovery and result.cause in ("unannounced_end", "no_line"):
         ctx.verdict(recovery, Status.FAILURE, "not_the_track", result.text)
-        recovery = ""
     if result.cause:
         await drive.rest()
-    return replace(result, values={**result.values, "recovery": recovery})
+    return result
 
 
 def _found(ctx: Context, result: Result, judged: bool) -> Result:
     """Return the result of a recovery; if it is to be judged, a found line is provisional, and
-    `run` is what following it judges. It is empty where nothing was found: that is final."""
+    `run` is what following it judges."""
     if not judged or result.status is Status.ERROR:
         return result
-    found = result.status is Status.SUCCESS
-    result = replace(result, values={**result.values, "run": ctx.run if found else ""})
-    return provisional(result) if found else result
+    result = replace(result, values={**result.values, "run": ctx.run})
+    return provisional(result) if result.status is Status.SUCCESS else result
 
 
 async def _along(drive: _Drive, plan: paths.Points) -> Result:
