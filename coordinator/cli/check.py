@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
         cell.faults.append(str(fault))
     faults = [*read.faults, *cell.faults]
     if read.value is None:
-        return _refused(options, task_path(options.task).stem, read, cell.faults)
+        raise _refused(options.json, task_path(options.task).stem, read, cell.faults)
     task = read.value
     with told_if_slow("searching the states of the task (Ctrl-C: what is known by now)"):
         judged, report = _checked(task, cell, code, search=not read.faults)
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
         report = _noted(report)
     if read.faults:
         others = [*cell.faults, *_independent(options.task, report, read, cell)]
-        return _refused(options, task.name, read, others)
+        raise _refused(options.json, task.name, read, others)
     report = CheckReport(tuple(f for f in report.findings if cell.is_new(f.key, f.text)))
     missing = _missing(task, services) if options.live and not faults else []
     analysis, ok = judged.analysis, judged.ok and report.ok and not faults
@@ -105,6 +105,8 @@ def run(options: argparse.Namespace) -> int:
         )
     if options.json != "-":
         print("\n".join(_text(options.task, judged, report, missing, faults)))
+    if faults:
+        raise CommandError(2, "\n".join(faults))
     return (
         2
         if not ok
@@ -116,19 +118,14 @@ def run(options: argparse.Namespace) -> int:
     )
 
 
-def _refused(
-    options: argparse.Namespace, task: str, read: FaultyFile[Task], more: list[str]
-) -> int:
-    """Say what is wrong in a task file whose net was not searched, also as JSON; return the exit
-    code. `more`: what else is wrong."""
+def _refused(json: str | None, task: str, read: FaultyFile[Task], more: list[str]) -> CommandError:
+    """Return the refusal of a task whose net was not searched, and write its JSON. `more`: what
+    else is wrong."""
     faults = [*read.faults, *more]
-    if options.json:
+    if json:
         findings = [_plain_fault(line, read.source) for line in faults]
-        write_json(options.json, {"task": task, "ok": False, "findings": findings})
-    if options.json != "-":
-        told = [str(Told(Severity.ERROR, line)) for line in faults]
-        print("\n".join([_because_of(options.task, faults), "", *told]))
-    return 2
+        write_json(json, {"task": task, "ok": False, "findings": findings})
+    return CommandError(2, "\n".join(faults))
 
 
 def _because_of(name: str, faults: list[str]) -> str:
@@ -448,9 +445,8 @@ def _text(
         but = [f"{part} was proved"] if open_ else []
         but += [f"runs take longer than {listed([*late])} on average"] if late else []
         yield wrapped(f"{name}: may run{f', but {listed(but)}' if but else ''}", 2)
-    if faults:  # they come first; of the rest, only what is wrong whatever they are
+    if faults:  # of the rest, only what is wrong whatever they are
         told = [one for one in told if one.severity is not Severity.NOTE]
-        told = [*(Told(Severity.ERROR, line) for line in faults), *told]
     if analysis is not None and (analysis.objections or not faults):
         yield from _summary(analysis)
         told += _reasons(analysis)

@@ -396,7 +396,7 @@ class Worker:
         self._report(now)
 
     def _may_begin(self) -> bool:
-        return not (self._spent or self._changed or self._place.runs)
+        return not (self._spent or self._place.runs)
 
     def _begin(self, now: float, call: Call) -> None:
         """Begin a call, unless the node has taken it back, or this process cannot be made as it was
@@ -405,18 +405,16 @@ class Worker:
         if self._changed:
             self._calls.appendleft(call)
         elif self._permits.take():
-            self._used = True
+            self._used = self._one_by_one
             self._place.take(now, call)
         else:
             self._node.post([DROPPED, [call.id]])
 
     def _restore(self) -> None:
-        """Undo what the last run has changed in this process, unless another run is active."""
-        if self._place.runs or not self._used:
-            return
-        if (why := self._surroundings.restored()) and not self._node.closed:
+        """Undo what the last run has changed in this process."""
+        if self._used and (why := self._surroundings.restored()) and not self._node.closed:
             _log.warning("a run has changed this process for good: %s", why)
-            self._changed = True
+            self._spent = self._changed = True
         self._used = False
 
     def _give_back(self) -> None:

@@ -49,8 +49,6 @@ block = {{ run = "toy_cell.actions:block", task = "sum", node = "left" }}
 chatter = {{ run = "toy_cell.actions:chatter", task = "sum", node = "left" }}
 write_down = {{ run = "toy_cell.actions:write_down", task = "sum", node = "left" }}
 change = {{ run = "toy_cell.actions:change", task = "sum", node = "left" }}
-change_eye = {{ run = "toy_cell.actions:change", task = "see", device = "eye" }}
-change_slide = {{ run = "toy_cell.actions:change", task = "move", device = "slide" }}
 """
 )
 WAYS = ("fork", "daemon", "program", "program with sockets")
@@ -430,18 +428,3 @@ async def test_what_a_run_changes_in_its_process_does_not_reach_the_next(
         again += end.values["pid"] == changed.values.get("pid")
         await asyncio.sleep(0.05)
     assert again or what in OF_NO_USE
-
-
-@pytest.mark.parametrize("service", ["change_eye", "change_slide"])
-@pytest.mark.parametrize("what", ["folder", "mask", "environment", "path", "built-in", "priority"])
-async def test_what_a_run_of_a_device_changes_does_not_reach_the_next(
-    operator: Operator, service: str, what: str
-) -> None:
-    before = (await operator.call(service)).values
-    changed = await operator.call(service, what=what)
-    assert changed.status == "success"
-    for _ in range(2):
-        end = await operator.call(service)
-        assert end.status == "success", end
-        assert end.values["found"] == before["found"]
-        assert end.values["pid"] == before["pid"] or what in OF_NO_USE

@@ -303,8 +303,8 @@ def test_an_unreadable_file_raises_the_systems_error(tmp_path: Path) -> None:
         ),
         (
             "unfinished:main",
-            "importing 'unfinished' raises SyntaxError: '(' was never closed (unfinished.py, line "
-            "2); correct the module",
+            "importing 'unfinished' raises SyntaxError: '(' was never closed (unfinished.py:2); "
+            "correct the module",
         ),
     ],
 )
