@@ -408,12 +408,9 @@ def test_weights_are_the_aalen_johansen_estimate() -> None:
         assert unended(runs.took.tolist(), causes) == pytest.approx((left, float(runs.took.max())))
 
 
-def test_beyond_the_longest_run_by_hand() -> None:
-    """One run ends at 1 s, two are censored at 2 and 3 s: two thirds remain, the share that a
-    constant rate would leave at 3 s."""
-    task = loads(ONE_WAY, "scan.toml")
-    runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
-    trials = [
+def watched(runs: list[tuple[str, float, str]]) -> list[Trial]:
+    """Return trials of one run each: its status, how long it took (s), and what preempted it."""
+    return [
         Trial(
             1,
             0.0,
@@ -423,6 +420,14 @@ def test_beyond_the_longest_run_by_hand() -> None:
         )
         for status, took, taken in runs
     ]
+
+
+def test_beyond_the_longest_run_by_hand() -> None:
+    """One run ends at 1 s, two are censored at 2 and 3 s: two thirds remain, the share that a
+    constant rate would leave at 3 s."""
+    task = loads(ONE_WAY, "scan.toml")
+    runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
+    trials = watched(runs)
     (context,) = RunDistributions(Training.of(task, trials)).contexts.values()
     assert context.ends.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
     assert context.ends.beyond.tolist() == [False, True, True]
@@ -434,16 +439,7 @@ def test_a_run_beyond_the_longest_one_ends_at_the_latest_at_its_deadline() -> No
     task = loads(ONE_WAY, "scan.toml")
     deadline = task.primitive_tasks["watch"].deadline
     runs = [("success", 1.0, "")] + [("", deadline - 1.0, "found")] * 9
-    trials = [
-        Trial(
-            1,
-            0.0,
-            runs=[
-                RunEntry("watch", "watch_a", 0.0, took, status, taken=taken, cancelled=bool(taken))
-            ],
-        )
-        for status, took, taken in runs
-    ]
+    trials = watched(runs)
     training = Training.of(task, trials)
     n, code = 500, training.vocabulary.actions.index("watch_a") + 1
     drawer = Drawer(RunDistributions(training), {}, np.ones((1, 10)), np.random.default_rng(1))
