@@ -129,7 +129,7 @@ class Seen:
 
     def note(
         self,
-        q: int,
+        q: Codes | int,
         columns: Codes | int,
         outcome: Codes | int,
         action: Codes | int,

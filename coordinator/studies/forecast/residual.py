@@ -458,13 +458,6 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
                 f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
                 "not allow it: when a run is preempted depends on more than the run"
             )
-    for place, n in sorted(played.queued.items()):
-        if n > NEGLIGIBLE * trials:
-            out.append(
-                f"in {n / trials:.1%} of the simulated trials a run that has ended stays in "
-                f"{place} while the next token waits there; the forecast begins the next run only "
-                "when it is taken, the engine at once"
-            )
     for name, n in sorted(played.barred.items()):
         if n > NEGLIGIBLE * trials:
             out.append(
