@@ -198,6 +198,14 @@ class Training:
     the result of a whole trial is unknown."""
     devices: Mapping[str, str] = field(default_factory=dict)
     """By action: the device for which its runs may have to wait, because other runs use it."""
+    same: bool = True
+    """False if the trials are of an earlier form of the task: they tell of its runs, but not what
+    whole trials come to."""
+
+    @property
+    def repeats(self) -> bool:
+        """Whether further trials will be as these, apart from other choices."""
+        return self.whole and self.same
 
     @classmethod
     def of(
@@ -207,6 +215,7 @@ class Training:
         *,
         whole: bool = True,
         devices: Mapping[str, str] | None = None,
+        same: bool = True,
     ) -> Training:
         """Prepare trials. `devices`: the device of each action that has one. Raises ValueError if
         there are no trials."""
@@ -234,6 +243,7 @@ class Training:
             {name: known for name, known in found.items() if known is not None},
             whole,
             waiting,
+            same,
         )
 
 
@@ -269,14 +279,44 @@ def _sets_flag(remembered: tuple[EventMemory, EarlyEvent] | None, wait: Waited) 
 
 
 def by_regime(
-    task: Task, rows: Iterable[TrialRow], devices: Mapping[str, str] | None = None
+    task: Task,
+    rows: Iterable[TrialRow],
+    devices: Mapping[str, str] | None = None,
+    same: bool = True,
 ) -> dict[str, Training]:
-    """Return the training of each regime of a table. `devices`: the device of each action."""
+    """Return the training of each regime of a table. `devices`: the device of each action; `same`:
+    whether the trials are of the task as it is."""
     trials: dict[str, list[Trial]] = {}
     for row in rows:
         if row.trial is not None:
             trials.setdefault(row.regime, []).append(row.trial)
-    return {regime: Training.of(task, kept, devices=devices) for regime, kept in trials.items()}
+    return {
+        regime: Training.of(task, kept, devices=devices, same=same)
+        for regime, kept in trials.items()
+    }
+
+
+def of_this_form(task: Task, rows: Iterable[TrialRow]) -> list[TrialRow]:
+    """Return the rows of an earlier form of a task without the runs that the task no longer has:
+    those of other places, or of other actions."""
+    return [
+        row
+        if row.trial is None
+        else replace(
+            row,
+            trial=replace(row.trial, runs=[run for run in row.trial.runs if _has(task.flat, run)]),
+        )
+        for row in rows
+    ]
+
+
+def _has(flat: Task, run: RunEntry) -> bool:
+    place = flat.places.get(run.place)
+    return (
+        place is not None
+        and place.kind is Kind.ACTION
+        and run.action in flat.primitive_task_of(run.place).alternatives
+    )
 
 
 def _cutting_timers(task: Task) -> list[str]:

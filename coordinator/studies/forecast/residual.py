@@ -320,7 +320,7 @@ def rare_doubts(
     those that entered a place, or whose run left it by a certain transition."""
     time = measured(training).time
     kept = ~np.isnan(time) & (weights > 0)
-    if not training.whole or not kept.any():
+    if not training.repeats or not kept.any():
         return []
     groups: dict[frozenset[int], str] = {}
     for name, members in _branches(training).items():
