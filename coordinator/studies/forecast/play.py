@@ -34,7 +34,7 @@ from petrobot.coordinator.task.net import Marking
 IDLE, QUEUED, GOING, DONE = range(4)
 _BY_RUN = (
     "_phase", "_status", "_want", "_preempted", "_end", "_action", "_outcome", "_took", "_came",
-    "_beyond", "_device", "_turn", "_order",
+    "_beyond", "_device", "_turn", "_entered", "_ended",
 )  # fmt: skip
 """Arrays with a row for each run."""
 Row: TypeAlias = int | Codes
@@ -129,8 +129,9 @@ class Play:
         self._preempted, self._beyond = np.zeros((2, *self._phase.shape), np.bool_)
         self._action, self._outcome = np.zeros((2, *self._phase.shape), np.int64)
         self._took = np.zeros(self._phase.shape)
-        self._order, self._orders = np.zeros_like(self._status), 0
-        """By run: its number among those that came, or that ended."""
+        self._entered, self._ended = np.zeros((2, *self._phase.shape), np.int64)
+        """By run: its number among those that came, and among those that ended."""
+        self._entries = self._ends_so_far = 0
         self._due = np.full((len(self._slow), n), np.inf)
         self._odd: dict[str, dict[str, set[int]]] = {}
         self._ways: dict[str, dict[str, int]] = {}
@@ -295,7 +296,8 @@ class Play:
         for arc in arcs:
             rows = np.array(self._runs_of(arc))
             fits = np.array([self._fits(m, arc, r, columns) for r in rows])
-            order = np.where(fits, self._order[rows][:, columns], _NEVER)
+            numbers = self._ended if arc in m.ended else self._entered
+            order = np.where(fits, numbers[rows][:, columns], _NEVER)
             order[rows == cut] = -1
             ranked.append(rows[order.argsort(axis=0, kind="stable")])
         judged = [k for k, arc in enumerate(arcs) if arc in m.ended]
@@ -341,7 +343,7 @@ class Play:
 
     def _enter(self, q: int, columns: Codes) -> None:
         """Put a run into the queue of its place, in the first row that is free."""
-        self._orders += 1
+        self._entries += 1
         for r in self._rows[q]:
             free = self._phase[r, columns] == IDLE
             self._queue(r, columns[free])
@@ -357,7 +359,7 @@ class Play:
             self._queue(self._rows[q][-1], columns)
 
     def _queue(self, run: int, columns: Codes) -> None:
-        self._phase[run, columns], self._order[run, columns] = QUEUED, self._orders
+        self._phase[run, columns], self._entered[run, columns] = QUEUED, self._entries
 
     def _admit(self, q: int, columns: Codes) -> None:
         """Begin runs while a server is free; further tokens wait."""
@@ -366,7 +368,7 @@ class Play:
             phase = self._phase[rows][:, columns]
             free = (phase == GOING).sum(axis=0) < self._servers[q]
             columns, phase = columns[free], phase[:, free]
-            waiting = np.where(phase == QUEUED, self._order[rows][:, columns], _NEVER)
+            waiting = np.where(phase == QUEUED, self._entered[rows][:, columns], _NEVER)
             fresh = waiting.min(axis=0) < _NEVER
             columns, first = columns[fresh], waiting[:, fresh].argmin(axis=0)
             for i in np.unique(first):
@@ -492,8 +494,8 @@ class Play:
             return
         q = int(self._place[run])
         self._end[run, columns] = np.inf
-        self._orders += 1
-        self._order[run, columns] = self._orders
+        self._ends_so_far += 1
+        self._ended[run, columns] = self._ends_so_far
         self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[run, columns]])
         self._seen.note(
             q,
