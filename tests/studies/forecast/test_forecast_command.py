@@ -246,7 +246,7 @@ def test_estimates_of_another_task_are_refused(
     assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 1
     shown = capsys.readouterr().out
     assert "no trials to compare with" in shown
-    assert "DOUBTFUL: locate and watch may run at the same time, and" in shown
+    assert "DOUBTFUL: locate and watch may be active at the same time, and" in shown
 
 
 # --- places that training never entered -------------------------------------------------------
