@@ -153,7 +153,7 @@ def _forecast(options: argparse.Namespace) -> int:
     file = task_path(options.task)
     trainings, estimates, about = _trainings(task, file, options.estimates, options.plant, cell)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
-    requests = {name: _request(task, trainings, name, options) for name in names}
+    requests = {name: _request(task, trainings, about, name, options) for name in names}
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
     made = register(task, trainings, requests, about, estimates, cell)
@@ -307,8 +307,13 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
 
 
 def _request(
-    task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
+    task: Task,
+    trainings: Mapping[str, Training],
+    about: Mapping[str, Any],
+    regime: str,
+    options: argparse.Namespace,
 ) -> Request:
+    from petrobot.coordinator.learning.estimates_file import MOCK
     from petrobot.coordinator.studies.campaign.policies import learned_choices
     from petrobot.coordinator.studies.forecast.choices import choices_of
     from petrobot.coordinator.studies.forecast.predict import Request
@@ -316,7 +321,14 @@ def _request(
     if regime not in trainings:
         raise CommandError(2, f"--regime {regime}: not measured; there are {', '.join(trainings)}")
     choices: dict[str, Mapping[str, float]] = dict(choices_of(trainings[regime]))
-    learned = {} if options.learned is None else learned_choices(options.learned)
+    learned = dict[str, dict[str, str]]()
+    if options.learned is not None:
+        learned = learned_choices(
+            options.learned,
+            task.name,
+            mock=about.get("plant") == MOCK,
+            physics=about.get("physics", ""),
+        )
     if options.learned is not None and regime not in learned:
         raise CommandError(
             2,
