@@ -313,6 +313,7 @@ def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
     chosen = pairs("--choose", filter(None, options.choose.split(",")), "TASK=ACTION")
     paths = {"task": str(task_path(options.task)), "services": str(options.services)}
     paths |= {"mock": str(options.mock)} if options.mock else {}
+    physics = _physics(options.services)
     return CampaignPlan(
         **{key: str(Path(path).resolve()) for key, path in paths.items()},
         runs=options.runs,
@@ -323,9 +324,9 @@ def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
         parameters={name: parameter_of(task, name, text) for name, text in given.items()},
         block=_block(task, options.block),
         batch=(options.batch or BATCH) if learns(options.selector) else 0,
-        options=_selector_options(options, regimes),
+        options=_selector_options(options, task, regimes, physics),
         digests={key: digest(path) for key, path in paths.items()},
-        physics=_physics(options.services),
+        physics=physics,
     )
 
 
@@ -350,7 +351,9 @@ def _block(task: Task, wanted: int | None) -> int:
     return wanted or max(1, tokens)
 
 
-def _selector_options(options: argparse.Namespace, regimes: Sequence[str]) -> dict[str, Any]:
+def _selector_options(
+    options: argparse.Namespace, task: Task, regimes: Sequence[str], physics: str
+) -> dict[str, Any]:
     from petrobot.coordinator.studies.campaign.policies import learned_choices, learns
 
     for name in () if learns(options.selector) else ("credit", "batch"):
@@ -370,7 +373,9 @@ def _selector_options(options: argparse.Namespace, regimes: Sequence[str]) -> di
             raise CommandError(
                 2, f"--learned chooses what was learned; leave --selector {options.selector} out"
             )
-        found["by_regime"] = learned = learned_choices(options.learned)
+        found["by_regime"] = learned = learned_choices(
+            options.learned, task.name, mock=bool(options.mock), physics=physics
+        )
         if unknown := [regime or "-" for regime in regimes if regime not in learned]:
             raise CommandError(
                 2,

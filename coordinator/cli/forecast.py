@@ -15,6 +15,7 @@ from petrobot.coordinator.cli.loading import (
     cell_finder,
     load_directory,
     load_task,
+    task_path,
     write_json,
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from petrobot.coordinator.analysis.may_run import Cell
     from petrobot.coordinator.learning.learning import Estimates
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
-    from petrobot.coordinator.studies.campaign.table import TrialRow
     from petrobot.coordinator.studies.forecast.history import Training
     from petrobot.coordinator.studies.forecast.predict import Request
     from petrobot.coordinator.task import Task
@@ -150,9 +150,10 @@ def _forecast(options: argparse.Namespace) -> int:
 
     task = load_task(options.task)
     cell = cell_finder(options.services, options.task)(task)
-    trainings, estimates, about = _trainings(task, options.estimates, options.plant, cell)
+    file = task_path(options.task)
+    trainings, estimates, about = _trainings(task, file, options.estimates, options.plant, cell)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
-    requests = {name: _request(task, trainings, name, options) for name in names}
+    requests = {name: _request(task, trainings, about, name, options) for name in names}
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
     made = register(task, trainings, requests, about, estimates, cell)
@@ -206,17 +207,18 @@ def _refuse_other_cell(
 
 
 def _trainings(
-    task: Task, path: Path, plant: str | None, cell: Cell | None
+    task: Task, file: Path, path: Path, plant: str | None, cell: Cell | None
 ) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
     """Training trials by regime in a cell, the estimates, and what the forecast says about where
     they come from."""
     from petrobot.coordinator.analysis.may_run import devices_of
     from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
     from petrobot.coordinator.studies.campaign.observed import estimates_of
-    from petrobot.coordinator.studies.campaign.plan import digest, read_manifest
+    from petrobot.coordinator.studies.campaign.plan import TASK_COPY, digest, read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table
     from petrobot.coordinator.studies.forecast.history import (
         by_regime,
+        of_this_form,
         read_estimates,
         trainings_of,
     )
@@ -239,10 +241,18 @@ def _trainings(
         raise CommandError(2, f"{path}: --plant {plant}: the campaign's runs are {own}")
     _refuse_other_task(task, plan, path)
     rows = list(read_table(path / TABLE))
-    _refuse_other_runs(task, rows, path)
-    found = by_regime(task, rows, devices_of(cell))
+    same = digest(file) == plan.digests["task"] or _same_form(task, path / TASK_COPY)
+    if not same:
+        rows = of_this_form(task, rows)
+    found = by_regime(task, rows, devices_of(cell), same)
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")
+    if not any(len(training.runs) for training in found.values()):
+        raise CommandError(
+            2,
+            f"{path / TABLE}: it has no run of an action place and an action of {file}, which has "
+            "changed: train again",
+        )
     about = {
         "estimates": {
             "campaign": path.name,
@@ -250,7 +260,7 @@ def _trainings(
             "block": plan.block,
             "sha256": digest(path / TABLE),
         },
-        "task_sha256": plan.digests["task"],
+        "task_sha256": digest(file),
         **_told(plan.physics, own),
     }
     return found, estimates_of(task, rows, path.name), about
@@ -260,6 +270,14 @@ def _told(physics: str, plant: str = "") -> dict[str, str]:
     """Return what a forecast says of the plant that it was trained in, and of the simulated
     laboratory's physics, if it has several."""
     return {k: v for k, v in (("plant", plant), ("physics", physics)) if v}
+
+
+def _same_form(task: Task, ran: Path) -> bool:
+    """Return whether a campaign's copy of its task file, which older campaigns lack, differs from
+    the task in words only."""
+    from petrobot.coordinator.task.file import dumps
+
+    return ran.is_file() and dumps(load_task(str(ran))) == dumps(task)
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:
@@ -278,38 +296,6 @@ def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:
         )
 
 
-def _refuse_other_runs(task: Task, rows: Iterable[TrialRow], path: Path) -> None:
-    """Check that the task still has the places and actions of the recorded runs. Raises
-    CommandError."""
-    from petrobot.coordinator.studies.campaign.table import TABLE
-
-    actions: dict[str, dict[str, None]] = {}
-    for row in rows:
-        for run in row.runs:
-            actions.setdefault(run.place, {})[run.action] = None
-    for place, found in actions.items():
-        known = task.flat.places.get(place)
-        if known is None or not known.task:
-            raise CommandError(
-                2,
-                f"{path / TABLE}: runs: {task.name} has no action place {place}; the task "
-                "file has changed: train again",
-            )
-        _refuse_other_actions(task, known.task, found, path / TABLE)
-
-
-def _refuse_other_actions(task: Task, primitive: str, actions: Iterable[str], source: Path) -> None:
-    offered = task.flat.primitive_tasks[primitive].alternatives
-    for action in actions:
-        if action not in offered:
-            raise CommandError(
-                2,
-                f"{source}: runs: {primitive} of {task.name} has no action {action} "
-                f"({', '.join(offered)}); the task file is "
-                "changed: train again",
-            )
-
-
 def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str]]) -> None:
     """Check that the estimates file has primitive tasks of this task. Raises CommandError."""
     if not set(found) & set(task.flat.primitive_tasks):
@@ -321,8 +307,13 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
 
 
 def _request(
-    task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
+    task: Task,
+    trainings: Mapping[str, Training],
+    about: Mapping[str, Any],
+    regime: str,
+    options: argparse.Namespace,
 ) -> Request:
+    from petrobot.coordinator.learning.estimates_file import MOCK
     from petrobot.coordinator.studies.campaign.policies import learned_choices
     from petrobot.coordinator.studies.forecast.choices import choices_of
     from petrobot.coordinator.studies.forecast.predict import Request
@@ -330,7 +321,14 @@ def _request(
     if regime not in trainings:
         raise CommandError(2, f"--regime {regime}: not measured; there are {', '.join(trainings)}")
     choices: dict[str, Mapping[str, float]] = dict(choices_of(trainings[regime]))
-    learned = {} if options.learned is None else learned_choices(options.learned)
+    learned = dict[str, dict[str, str]]()
+    if options.learned is not None:
+        learned = learned_choices(
+            options.learned,
+            task.name,
+            mock=about.get("plant") == MOCK,
+            physics=about.get("physics", ""),
+        )
     if options.learned is not None and regime not in learned:
         raise CommandError(
             2,

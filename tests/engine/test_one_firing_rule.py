@@ -37,7 +37,7 @@ from petrobot.coordinator.engine.firing import arcs_satisfied, token_enabled
 from petrobot.coordinator.studies.forecast.distributions import Drawer
 from petrobot.coordinator.studies.forecast.history import STATUSES
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
-from petrobot.coordinator.studies.forecast.play import DONE, GOING, Play
+from petrobot.coordinator.studies.forecast.play import DONE, GOING, IDLE, Play
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
 from tests.engine.test_properties import DEVICES, Journal, tasks
@@ -142,32 +142,51 @@ def simulator_agrees(net: Net, markings: list[Marking]) -> None:
 class Frozen(Play):
     """A forecast whose runs are set by the test, and neither drawn nor counted."""
 
-    def _start(self, q: int, columns: Any) -> None:
+    def _admit(self, q: int, columns: Any) -> None:
         """No run is drawn."""
 
-    def _cut(self, q: int, m: Any, counts: Any, columns: Any) -> None:
+    def _cut(self, m: Any, counts: Any, rows: Any, columns: Any) -> None:
         """No run is counted."""
 
     def put(self, states: list[State]) -> None:
         """One column for each state."""
         self._tokens = np.array([s.marking for s in states], dtype=np.int64).T.copy()
+        self.names = dict[tuple[int, int], str]()  # of the runs, by row and column
         for q, place in enumerate(self._s.vocabulary.places):
             for i, state in enumerate(states):
                 for run in state.tokens.get(place, ()):
-                    self._phase[q, i] = DONE if run.phase is Phase.DONE else GOING
+                    self._enter(q, np.array([i]))
+                    (row,) = (r for r in self._rows[q] if self._entered[r, i] == self._entries)
+                    self.names[row, i] = run.id
+                    if run.phase is not Phase.QUEUED:
+                        self._phase[row, i] = DONE if run.phase is Phase.DONE else GOING
                     if run.status is not None:
-                        self._status[q, i] = STATUSES.index(run.status)
+                        self._status[row, i] = STATUSES.index(run.status)
+                        self._ended[row, i] = run.ended
 
     def agrees(self, task: Task, states: list[State]) -> None:
-        """The transitions whose arcs are satisfied are the engine's, and so is each successor."""
+        """The transitions whose arcs are satisfied are the engine's, and so are the runs that they
+        take and each successor."""
         compiled = Engine(task, DEVICES).compiled
         for move in self._s.moves:
             x, before = compiled.transitions[move.number], self._tokens.copy()
-            able = self._enabled(replace(move, allowed=None))
+            unjudged = replace(move, allowed=None)
+            able = self._enabled(unjudged)
             unheard = replace(x, actions=tuple(replace(a, raised=()) for a in x.actions), when=None)
             for i, state in enumerate(states):
-                draft = Draft(compiled, state)
-                assert bool(able[i]) == (arcs_satisfied(draft, unheard) is not None), move.name
+                runs = arcs_satisfied(Draft(compiled, state), unheard)
+                assert bool(able[i]) == (runs is not None), move.name
+                if runs is not None:
+                    rows = np.concatenate(
+                        [
+                            [],
+                            *(
+                                found[:, 0]
+                                for found in self._selected(unjudged, np.array([i]), None)
+                            ),
+                        ]
+                    )
+                    assert [self.names[int(r), i] for r in rows] == [run.id for run in runs]
             rows = concession(self._s.rule, before, move.number)
             assert not (able & ~rows).any()
             columns = np.flatnonzero(able)
@@ -176,19 +195,17 @@ class Frozen(Play):
             for i in columns.tolist():
                 expected = successor(task.net, states[i].marking, move.number)
                 assert tuple(self._tokens[:, i].tolist()) == expected, move.name
-            self._tokens, self._phase = before, phases
+            self._tokens = before
+            self._phase[: len(phases)], self._phase[len(phases) :] = phases, IDLE
 
 
 def forecast_agrees(task: Task, states: list[State]) -> None:
-    """Compare states with at most one run per place, none of which is stopping: a forecast has no
-    others."""
+    """Compare states in which no run is still stopping: a forecast has no others."""
     try:
         structure = Structure.of(task)
     except ValueError:
-        return  # several servers, or a preemption that forecasts refuse
-    fit = [
-        s for s in states if not s.stopping and all(len(runs) <= 1 for runs in s.tokens.values())
-    ]
+        return  # a preemption that forecasts refuse
+    fit = [s for s in states if not s.stopping]
     if fit:
         frozen = Frozen(structure, cast(Drawer, None), {}, np.zeros(len(fit), np.int64))
         frozen.put(fit)

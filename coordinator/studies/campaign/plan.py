@@ -23,6 +23,7 @@ SEEDS = 1_000_000
 """Mission seeds reserved for each campaign seed."""
 MANIFEST = "campaign.json"
 TABLE = "table.csv"
+TASK_COPY = "task.toml"
 SCHEMA = 1
 
 
@@ -163,7 +164,8 @@ def digest(path: Path | str) -> str:
 
 
 def write_manifest(folder: Path, plan: CampaignPlan) -> None:
-    """Write the plan beside its table."""
+    """Write the plan and a copy of the task file beside its table. Raises OSError."""
+    write_whole(folder / TASK_COPY, Path(plan.task).read_text(encoding="utf-8"))
     write_whole(folder / MANIFEST, json_text(plan.to_plain(), indent=2) + "\n")
 
 

@@ -21,10 +21,15 @@ from petrobot.coordinator.learning.records import Choice, RunEnd
 from petrobot.coordinator.learning.selectors import ACTION, RULES, TASK, verdicts_of_task
 from petrobot.coordinator.studies.campaign.block import Weights
 from petrobot.coordinator.studies.campaign.observed import context_of, observation, regime_of
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan
+from petrobot.coordinator.studies.campaign.plan import (
+    Block,
+    CampaignError,
+    CampaignPlan,
+    read_manifest,
+)
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.task import Task
-from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import FIRST_PHYSICS, Directory, same_physics
 
 
 class ChoicePolicy(ABC):
@@ -273,9 +278,12 @@ def policy_of(plan: CampaignPlan, task: Task, directory: Directory) -> ChoicePol
     return LearnedActions(task, plan.selector, alternatives, plan.chosen, question, credit)
 
 
-def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
+def learned_choices(
+    folder: Path, task: str, *, mock: bool, physics: str
+) -> dict[str, dict[str, str]]:
     """Return, by regime, the best action of each primitive task in the result of a learning
-    campaign. Raises CampaignError."""
+    campaign. Raises CampaignError, also if it learned in another task, or with other actions than
+    the new runs have: scripted ones (`mock`), or those of a laboratory with another physics."""
     path = folder / "result.json"
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
@@ -291,16 +299,31 @@ def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
             f"{path}: not the result of a finished campaign: not JSON ({fault})"
         ) from fault
     try:
+        if result["task"] != task:
+            raise CampaignError(f"{folder}: it learned in the task {result['task']}, not in {task}")
         if result["selector"] in PLAIN:
             raise CampaignError(
                 f"{folder}: the selector {result['selector']} has learned nothing; give one "
                 "that learns"
             )
-        return {
+        found = {
             regime: {t: known["best"] for t, known in tasks.items()}
             for regime, tasks in result["policy"].items()
         }
     except (KeyError, TypeError, AttributeError) as fault:
         raise CampaignError(
-            f"{path}: not the result of a campaign: selector or policy is missing"
+            f"{path}: not the result of a campaign: task, selector or policy is missing"
         ) from fault
+    plan = read_manifest(folder)
+    if bool(plan.mock) is not mock or not same_physics(plan.physics, physics):
+        learned, new = (
+            "scripted actions (--mock)"
+            if scripted
+            else f"actions in the physics {physics or FIRST_PHYSICS!r}"
+            for scripted, physics in ((bool(plan.mock), plan.physics), (mock, physics))
+        )
+        raise CampaignError(
+            f"{folder}: it learned with {learned}, the new runs have {new}; learn with those, or "
+            "name the actions by --choose"
+        )
+    return found

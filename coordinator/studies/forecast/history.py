@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -129,7 +130,7 @@ class Seen:
 
     def note(
         self,
-        q: int,
+        q: Codes | int,
         columns: Codes | int,
         outcome: Codes | int,
         action: Codes | int,
@@ -198,6 +199,14 @@ class Training:
     the result of a whole trial is unknown."""
     devices: Mapping[str, str] = field(default_factory=dict)
     """By action: the device for which its runs may have to wait, because other runs use it."""
+    same: bool = True
+    """False if the trials are of an earlier form of the task: they tell of its runs, but not what
+    whole trials come to."""
+
+    @property
+    def repeats(self) -> bool:
+        """Whether further trials will be as these, apart from other choices."""
+        return self.whole and self.same
 
     @classmethod
     def of(
@@ -207,6 +216,7 @@ class Training:
         *,
         whole: bool = True,
         devices: Mapping[str, str] | None = None,
+        same: bool = True,
     ) -> Training:
         """Prepare trials. `devices`: the device of each action that has one. Raises ValueError if
         there are no trials."""
@@ -234,6 +244,7 @@ class Training:
             {name: known for name, known in found.items() if known is not None},
             whole,
             waiting,
+            same,
         )
 
 
@@ -269,14 +280,44 @@ def _sets_flag(remembered: tuple[EventMemory, EarlyEvent] | None, wait: Waited) 
 
 
 def by_regime(
-    task: Task, rows: Iterable[TrialRow], devices: Mapping[str, str] | None = None
+    task: Task,
+    rows: Iterable[TrialRow],
+    devices: Mapping[str, str] | None = None,
+    same: bool = True,
 ) -> dict[str, Training]:
-    """Return the training of each regime of a table. `devices`: the device of each action."""
+    """Return the training of each regime of a table. `devices`: the device of each action; `same`:
+    whether the trials are of the task as it is."""
     trials: dict[str, list[Trial]] = {}
     for row in rows:
         if row.trial is not None:
             trials.setdefault(row.regime, []).append(row.trial)
-    return {regime: Training.of(task, kept, devices=devices) for regime, kept in trials.items()}
+    return {
+        regime: Training.of(task, kept, devices=devices, same=same)
+        for regime, kept in trials.items()
+    }
+
+
+def of_this_form(task: Task, rows: Iterable[TrialRow]) -> list[TrialRow]:
+    """Return the rows of an earlier form of a task without the runs that the task no longer has:
+    those of other places, or of other actions."""
+    return [
+        row
+        if row.trial is None
+        else replace(
+            row,
+            trial=replace(row.trial, runs=[run for run in row.trial.runs if _has(task.flat, run)]),
+        )
+        for row in rows
+    ]
+
+
+def _has(flat: Task, run: RunEntry) -> bool:
+    place = flat.places.get(run.place)
+    return (
+        place is not None
+        and place.kind is Kind.ACTION
+        and run.action in flat.primitive_task_of(run.place).alternatives
+    )
 
 
 def _cutting_timers(task: Task) -> list[str]:
@@ -439,14 +480,16 @@ def _trials(task: Task, estimates: Estimates, regime: str) -> list[Trial]:
 
 def _runs_of_sums(place: str, action: str, tally: Tally) -> list[RunEntry]:
     """Return runs with the counts of the tally and the durations of its sample, repeated as needed;
-    the mean if an exit has no sampled run."""
+    the mean if an exit has no sampled run. They are scaled to the mean of all runs: that of 512
+    sampled ones is by itself off by some per cent, which no interval of all runs contains."""
     out: list[RunEntry] = []
     for exit_, moments in tally.durations.items():
         counted, _, transition = exit_.partition(":")
         seconds = tally.sample.seconds([exit_]) or [moments.mean]
+        scale = moments.mean / fmean(seconds) if any(seconds) else 1.0
         status = "" if counted == CENSORED_CAUSE else counted
         for i in range(moments.n):
-            took = seconds[i % len(seconds)]
+            took = scale * seconds[i % len(seconds)]
             out.append(
                 RunEntry(
                     place,

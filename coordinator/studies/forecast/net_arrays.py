@@ -3,6 +3,7 @@ transition takes its condition admits."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -12,36 +13,31 @@ from petrobot.coordinator.analysis.time.measured import EMERGENCY, FIELDS, is_ca
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.history import STATUSES, RunVocabulary, reads_variables
 from petrobot.coordinator.task import (
-    Counts,
     EarlyEvent,
     End,
     EventMemory,
     Executed,
-    Kind,
     Status,
     Task,
     Transition,
 )
-from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
+from petrobot.coordinator.task.compiled_task import (
+    ActionArc,
+    CompiledTransition,
+    compile_transitions,
+)
 from petrobot.coordinator.task.conditions import ConditionFault, Literal, walk
 from petrobot.coordinator.task.net import CompiledNet
 
 
 @dataclass(frozen=True)
 class Move:
-    """A compiled transition with what playing it needs. Runs are numbers of action places."""
+    """A compiled transition with what playing it needs."""
 
     transition: CompiledTransition
-    normal: tuple[int, ...]
-    error: tuple[int, ...]
-    going: tuple[int, ...]
-    preempt: tuple[tuple[int, Counts, bool], ...]
-    """(action place, how the run counts, whether a run that has ended is taken, too)."""
     cause: bool
     """Its preemption is a cause by which a run ends, drawn with the run; else it preempts as soon
     as it can fire."""
-    starts: tuple[int, ...]
-    """Action places in which it starts a run."""
     waits: bool
     """For an event or a timer."""
     memory: tuple[EventMemory, EarlyEvent] | None
@@ -49,7 +45,7 @@ class Move:
     mean_wait: float | None
     """Declared mean time until all of its events have come (s); None: not declared."""
     allowed: np.ndarray | None
-    """Which statuses of the runs it takes (axes: normal, then error) its condition admits; None:
+    """Which statuses of the ended runs it takes (axes: its arcs) its condition admits; None:
     any."""
     is_goal: bool
     takes_run: bool
@@ -64,6 +60,11 @@ class Move:
     def number(self) -> int:
         """Index of the transition in the net."""
         return self.transition.index
+
+    @property
+    def ended(self) -> list[ActionArc]:
+        """Its arcs that take runs that have ended."""
+        return [arc for arc in self.transition.actions if arc.end in (End.NORMAL, End.ERROR)]
 
     @property
     def priority(self) -> int:
@@ -82,8 +83,8 @@ class Structure:
     initial: np.ndarray
     rule: CompiledNet
     """The firing rule of the task's net."""
-    action_places: tuple[int, ...]
-    """Index in the net of each action place."""
+    codes: Mapping[int, int]
+    """By index in the net of an action place: its code in the vocabulary."""
     assumptions: tuple[str, ...]
 
     @classmethod
@@ -92,17 +93,10 @@ class Structure:
         what cannot be played, with the remedy."""
         flat = task.flat
         vocabulary = RunVocabulary.of(flat)
-        for place in flat.places.values():
-            if place.kind is Kind.ACTION and place.most_active > 1:
-                raise ValueError(
-                    f"places.{place.name}: it has servers = {place.most_active}, but a forecast "
-                    "plays one run of a place at a time; forecast a copy of the task with "
-                    "servers = 1 there, where further runs wait, or run a campaign of the task"
-                )
         for t in flat.transitions.values():
-            _refuse_unknown_preemption(t)
+            _refuse_unknown_preemption(flat, t)
         moves = tuple(
-            _move(flat, vocabulary, t, compiled)
+            _move(flat, t, compiled)
             for t, compiled in zip(
                 flat.transitions.values(), compile_transitions(flat), strict=True
             )
@@ -110,7 +104,7 @@ class Structure:
         initial = np.array(flat.net.initial, np.int64)
         if flat.runs_place:
             initial[flat.net.place_index[flat.runs_place]] = 1
-        indices = tuple(flat.net.place_index[name] for name in vocabulary.places)
+        codes = {flat.net.place_index[name]: q for q, name in enumerate(vocabulary.places)}
         source = (
             "how often its condition holds is taken from the runs that it took"
             if whole
@@ -122,48 +116,41 @@ class Structure:
             for t, m in zip(flat.transitions.values(), moves, strict=True)
             if reads_variables(t) and (whole or m.allowed is not None)
         )
-        return cls(flat, vocabulary, moves, initial, flat.net.compiled, indices, assumptions)
+        return cls(flat, vocabulary, moves, initial, flat.net.compiled, codes, assumptions)
 
 
 def _move(
     flat: Task,
-    vocabulary: RunVocabulary,
     t: Transition,
     compiled: CompiledTransition,
 ) -> Move:
-    net = flat.net
-    number_of = {net.place_index[name]: q for q, name in enumerate(vocabulary.places)}
-    by_end = {
-        end: tuple(number_of[a.place] for a in compiled.actions if a.end is end)
-        for end in (End.NORMAL, End.ERROR, End.GOING)
-    }
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
     return Move(
         compiled,
-        by_end[End.NORMAL],
-        by_end[End.ERROR],
-        by_end[End.GOING],
-        tuple(
-            (number_of[a.place], a.counts, a.takes_done)
-            for a in compiled.actions
-            if a.end is End.PREEMPT
-        ),
         is_cause(t),
-        tuple(number_of[p] for p, _, is_action in compiled.produce if is_action),
         bool(t.events) or t.after is not None,
         memory_of(flat, t),
         max(means) if means and len(means) == len(waits_known) else None,
-        _allowed(t, [vocabulary.places[q] for q in by_end[End.NORMAL] + by_end[End.ERROR]]),
+        _allowed(t, [a.name for a in compiled.actions if a.end in (End.NORMAL, End.ERROR)]),
         t.name in flat.goal_transitions,
         any(a.place == flat.runs_place for a in t.inputs),
     )
 
 
-def _refuse_unknown_preemption(t: Transition) -> None:
+def _refuse_unknown_preemption(task: Task, t: Transition) -> None:
     """What preempts must follow from the marking, or be measured: an event's time from the begin of
     the one run that it takes."""
     runs = [a for a in t.inputs if a.end is not None]
+    several = [a for a in runs if a.end is End.PREEMPT and task.places[a.place].most_active > 1]
+    if is_cause(t) and several:
+        place = task.places[several[0].place]
+        raise ValueError(
+            f"transitions.{t.name}: it preempts a run of {place.name}, which has servers = "
+            f"{place.most_active}, but a forecast knows only how often the one run of a place is "
+            "preempted; forecast a copy of the task with servers = 1 there, where further runs "
+            "wait, or run a campaign of the task"
+        )
     if is_cause(t) or not any(a.end is End.PREEMPT for a in runs):
         return
     if reads_variables(t) and not any(a.end in (End.NORMAL, End.ERROR) for a in runs):

@@ -1,20 +1,24 @@
 """Plays trials of a task through its net, many side by side: runs end as their laws draw, the net
 says what follows.
 
+A row of the arrays holds one run of an action place, from the queue to the transition that takes
+it. A place has as many rows as it ever held tokens at once.
+
 This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place
 an action is chosen, then how and when its run will end is drawn in one draw (competing risks: of
 itself with a status, or preempted by an event or a timer); transitions that wait for events or
 timers race with their measured waits, or with the rates of their events; everything else fires at
 once, also what preempts a run because another one has ended. Runs wait for their devices, tokens
-for the run before them, and transitions for a token that others want, too, as in the engine: first
+for a server, and transitions for a token that others want, too, as in the engine: first
 come, first served.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from itertools import product
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -23,10 +27,19 @@ from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
-from petrobot.coordinator.task import Counts, EarlyEvent, EventMemory, Start, Status
+from petrobot.coordinator.task import Counts, EarlyEvent, End, EventMemory, Start, Status
+from petrobot.coordinator.task.compiled_task import ActionArc
 from petrobot.coordinator.task.net import Marking
 
-IDLE, GOING, DONE = 0, 1, 2
+IDLE, QUEUED, GOING, DONE = range(4)
+_BY_RUN = (
+    "_phase", "_status", "_want", "_preempted", "_end", "_action", "_outcome", "_took", "_came",
+    "_beyond", "_device", "_turn", "_entered", "_ended",
+)  # fmt: skip
+"""Arrays with a row for each run."""
+Row: TypeAlias = int | Codes
+Columns: TypeAlias = slice | Codes
+ALL = slice(None)
 _NEVER, _LEAST = np.iinfo(np.int64).max, np.iinfo(np.int64).min
 LONGEST = 10_000
 """After so many firings at one time, or so many steps, a trial counts as one that never ends."""
@@ -54,9 +67,6 @@ class Played:
     barred: Mapping[str, int] = field(default_factory=dict)
     """By transition: trials that came to a stop where it could have started a run in a place of
     which nothing was measured. It never fires."""
-    queued: Mapping[str, int] = field(default_factory=dict)
-    """By action place: trials in which a run that had ended was still there while the next token
-    waited. The engine begins the next run then; here it begins when the ended one is taken."""
     ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By action place: how often each transition took a token out of it."""
 
@@ -78,17 +88,19 @@ class Play:
         probabilities."""
         self._longest = longest
         self._s, self._drawer = structure, drawer
-        n, q = len(replicate), len(structure.vocabulary.places)
-        self._choices = [self._choice(choices, name) for name in structure.vocabulary.places]
-        known = [len(codes) > 0 for codes, _ in self._choices]
-        self._barred = [m for m in structure.moves if not all(known[q] for q in m.starts)]
-        free = [m for m in structure.moves if all(known[q] for q in m.starts)]
+        n, places = len(replicate), structure.vocabulary.places
+        self._choices = [self._choice(choices, name) for name in places]
+        unknown = {p for p, q in structure.codes.items() if not len(self._choices[q][0])}
+        self._barred, free = list[Move](), list[Move]()
+        for m in structure.moves:
+            starts = {p for p, _, is_action in m.transition.produce if is_action}
+            (self._barred if starts & unknown else free).append(m)
         self._quick = [m for m in free if not m.waits]
         self._slow = [m for m in free if m.waits and not m.cause]
         self._certain = [
             m
             for m in self._quick
-            if (m.normal or m.error)
+            if m.ended
             and (m.allowed is not None or structure.task.transitions[m.name].when is None)
         ]
         """Transitions that take an ended run and surely fire as soon as the marking allows it."""
@@ -104,13 +116,23 @@ class Play:
         self._column = np.arange(n)
         self._replicate = replicate
         self._tokens = np.repeat(structure.initial[:, None], n, axis=1)
-        self._phase = np.zeros((q, n), np.int8)
-        self._status, self._want = np.zeros((q, n), np.int64), np.full((q, n), -1)
-        self._came = np.zeros((q, n))
-        self._preempted, self._end = np.zeros((q, n), np.bool_), np.full((q, n), np.inf)
+        self._place = np.arange(len(places))
+        """By row: the code of its place."""
+        self._rows = [[q] for q in range(len(places))]
+        """By place: its rows."""
+        self._phase = np.zeros((len(places), n), np.int8)
+        self._status, self._want = (
+            np.zeros_like(self._phase, np.int64),
+            np.full(self._phase.shape, -1),
+        )
+        self._came, self._end = np.zeros(self._phase.shape), np.full(self._phase.shape, np.inf)
+        self._preempted, self._beyond = np.zeros((2, *self._phase.shape), np.bool_)
+        self._action, self._outcome = np.zeros((2, *self._phase.shape), np.int64)
+        self._took = np.zeros(self._phase.shape)
+        self._entered, self._ended = np.zeros((2, *self._phase.shape), np.int64)
+        """By run: its number among those that came, and among those that ended."""
+        self._entries = self._ends_so_far = 0
         self._due = np.full((len(self._slow), n), np.inf)
-        self._action, self._outcome = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
-        self._took, self._beyond = np.zeros((q, n)), np.zeros((q, n), np.bool_)
         self._odd: dict[str, dict[str, set[int]]] = {}
         self._ways: dict[str, dict[str, int]] = {}
         names, actions = sorted(set((devices or {}).values())), structure.vocabulary.actions
@@ -119,21 +141,15 @@ class Play:
         )
         """By code of an action: its device; -1 for none."""
         self._devices = range(len(names))
+        self._servers = [structure.task.places[p].most_active for p in places]
         self._at_once = np.array(
-            [
-                structure.task.primitive_task_of(p).start is Start.AT_ONCE
-                for p in structure.vocabulary.places
-            ]
+            [structure.task.primitive_task_of(p).start is Start.AT_ONCE for p in places]
         )
-        self._awaited = [
-            i
-            for i, p in enumerate(structure.vocabulary.places)
-            if not structure.task.places[p].listen
-        ]
-        self._device, self._turn = np.full((q, n), -1), np.zeros((q, n), np.int64)
+        self._awaited = np.array([not structure.task.places[p].listen for p in places])
+        self._device, self._turn = np.full_like(self._want, -1), np.zeros_like(self._want)
         """By run: its device, and its number among those that wait for one; 0 if it does not."""
         self._turns = 0
-        self._seen = Seen.nothing(q, n)
+        self._seen = Seen.nothing(len(places), n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
         self._ends: dict[Marking, int] = {}
@@ -150,13 +166,16 @@ class Play:
 
     def run(self) -> Played:
         """Play all to their ends. Raises KeyError and ValueError for what was never measured."""
-        for q in range(len(self._s.action_places)):
-            self._admit(q, np.arange(len(self._column)))
+        for p, q in self._s.codes.items():
+            for _ in range(int(self._s.initial[p])):
+                self._enter(q, np.arange(len(self._column)))
         for _ in range(self._longest):
             self._settle()
             self._finish(self._over())
             if not len(self._column):
                 break
+            for q in range(len(self._rows)):
+                self._admit(q, np.arange(len(self._column)))
             self._grant()
             self._advance(self._wait())
         odd: dict[str, Any] = {
@@ -201,7 +220,10 @@ class Play:
         measured, released = self._want, np.zeros_like(held)
         self._want = np.where(held, -1, measured)
         for m in self._certain:
-            released[[*m.normal, *m.error]] |= self._enabled(m)
+            able = self._enabled(m)
+            for arc in m.ended:
+                for r in self._runs_of(arc):
+                    released[r] |= able & self._fits(m, arc, r)
         self._want = np.where(released, -1, measured)
         return bool((held & released).any())
 
@@ -234,52 +256,123 @@ class Play:
 
     def _enabled(self, m: Move) -> Mask:
         out = concession(self._s.rule, self._tokens, m.number)
-        for q in m.normal:
-            out &= (self._phase[q] == DONE) & (self._status[q] != ERROR) & self._wanted(q, m)
-        for q in m.error:
-            out &= (self._phase[q] == DONE) & (self._status[q] == ERROR) & self._wanted(q, m)
-        for q in m.going:
-            out &= self._phase[q] == GOING
-        for q, _, takes_done in m.preempt:
-            out &= (self._phase[q] != IDLE) if takes_done else (self._phase[q] == GOING)
+        for arc in m.transition.actions:
+            fitting = [self._fits(m, arc, r) for r in self._runs_of(arc)]
+            out &= sum(fitting[1:], fitting[0].astype(np.int64)) >= arc.weight
         if m.allowed is not None:
-            runs = m.normal + m.error
-            ended = [np.clip(self._status[q], 0, None) for q in runs]
-            # a run whose measured transition is known shows that the condition held
-            known = [self._want[q] == m.number for q in runs]
-            out &= m.allowed[tuple(ended)] | np.any(known, axis=0)
+            runs = product(*(self._runs_of(arc) for arc in m.ended))
+            out &= np.any([self._admits(m, m.allowed, those) for those in runs], axis=0)
         return out
 
-    def _wanted(self, q: int, m: Move) -> Mask:
-        free: Mask = (self._want[q] < 0) | (self._want[q] == m.number)
-        return free
+    def _runs_of(self, arc: ActionArc) -> list[int]:
+        return self._rows[self._s.codes[arc.place]]
 
-    def _fire(self, m: Move, columns: Codes) -> None:
+    def _fits(self, m: Move, arc: ActionArc, run: Row, columns: Columns = ALL) -> Mask:
+        """Return where the arc may take the run."""
+        phase = self._phase[run, columns]
+        if arc.end is End.GOING or arc.end is End.PREEMPT:
+            active: Mask = (phase == QUEUED) | (phase == GOING)
+            return active | (phase == DONE) if arc.takes_done else active
+        error = self._status[run, columns] == ERROR
+        want = self._want[run, columns]
+        fits: Mask = (phase == DONE) & (error == (arc.end is End.ERROR))
+        fits &= (want < 0) | (want == m.number)
+        return fits
+
+    def _admits(self, m: Move, allowed: Mask, runs: Sequence[Row], columns: Columns = ALL) -> Mask:
+        """Return where the condition admits these ended runs, one for each arc that takes any."""
+        out: Mask = allowed[tuple(np.clip(self._status[r, columns], 0, None) for r in runs)]
+        # a run whose measured transition is known shows that the condition held
+        out = out | np.any([self._want[r, columns] == m.number for r in runs], axis=0)
+        for arc, r in zip(m.ended, runs, strict=True):
+            out = out & self._fits(m, arc, r, columns)
+        return out
+
+    def _selected(self, m: Move, columns: Codes, cut: int | None) -> list[Codes]:
+        """Return the runs that each arc takes: for action arc k an array (weight, columns) of rows.
+        As in the engine: the first ones that ended or, of active ones, that came; if a condition
+        judges them, the first that it admits. `cut`: the run that the firing preempts."""
+        arcs, ranked = m.transition.actions, list[Codes]()
+        for arc in arcs:
+            rows = np.array(self._runs_of(arc))
+            fits = np.array([self._fits(m, arc, r, columns) for r in rows])
+            numbers = self._ended if arc in m.ended else self._entered
+            order = np.where(fits, numbers[rows][:, columns], _NEVER)
+            order[rows == cut] = -1
+            ranked.append(rows[order.argsort(axis=0, kind="stable")])
+        judged = [k for k, arc in enumerate(arcs) if arc in m.ended]
+        if m.allowed is not None and any(len(ranked[k]) > 1 for k in judged):
+            left = np.ones(len(columns), np.bool_)
+            for first in product(*(range(len(ranked[k]) - arcs[k].weight + 1) for k in judged)):
+                begins = list(zip(judged, first, strict=True))
+                runs = [ranked[k][i + arcs[k].weight - 1] for k, i in begins]
+                now = left & self._admits(m, m.allowed, runs, columns)
+                for k, i in begins:
+                    weight = arcs[k].weight
+                    ranked[k][:weight, now] = ranked[k][i : i + weight, now]
+                left &= ~now
+        return [rows[: arc.weight] for arc, rows in zip(arcs, ranked, strict=True)]
+
+    def _fire(self, m: Move, columns: Codes, cut: int | None = None) -> None:
+        """Fire in these columns. `cut`: the row of the run that preempts itself."""
+        selected = self._selected(m, columns, cut)
         for place, change in m.transition.changes:
             self._tokens[place, columns] += change
-        for q, counts, _ in m.preempt:
-            if not m.cause:
-                self._cut(q, m, counts, columns[self._phase[q, columns] == GOING])
-        taken = (*m.normal, *m.error, *(q for q, _, _ in m.preempt))
-        for q in taken:
-            self._phase[q, columns], self._end[q, columns] = IDLE, np.inf
-            self._device[q, columns], self._turn[q, columns] = -1, 0
-            ways = self._ways.setdefault(self._s.vocabulary.places[q], {})
-            ways[m.name] = ways.get(m.name, 0) + len(columns)
+        taken = list[int]()
+        for arc, rows in zip(m.transition.actions, selected, strict=True):
+            if arc.end is End.GOING:
+                continue
+            taken.append(self._s.codes[arc.place])
+            if arc.end is End.PREEMPT and not m.cause:
+                for row in rows:
+                    self._cut(m, arc.counts, row, columns)
+            self._phase[rows, columns], self._end[rows, columns] = IDLE, np.inf
+            self._device[rows, columns], self._turn[rows, columns] = -1, 0
+            ways = self._ways.setdefault(arc.name, {})
+            ways[m.name] = ways.get(m.name, 0) + rows.size
         if m.takes_run:
             self._begun[columns] = self._now[columns]
         self._goals[columns] += m.is_goal
-        for q in dict.fromkeys((*taken, *m.starts)):
+        for place, weight, is_action in m.transition.produce:
+            if is_action:
+                taken.append(self._s.codes[place])
+                for _ in range(weight):
+                    self._enter(taken[-1], columns)
+        for q in dict.fromkeys(taken):
             self._admit(q, columns)
 
+    def _enter(self, q: int, columns: Codes) -> None:
+        """Put a run into the queue of its place, in the first row that is free."""
+        self._entries += 1
+        for r in self._rows[q]:
+            free = self._phase[r, columns] == IDLE
+            self._queue(r, columns[free])
+            columns = columns[~free]
+        if len(columns):
+            self._rows[q].append(len(self._place))
+            self._place = np.append(self._place, q)
+            for name in _BY_RUN:
+                own: np.ndarray = getattr(self, name)
+                setattr(self, name, np.concatenate([own, own[:1]]))
+            self._phase[-1], self._end[-1], self._want[-1] = IDLE, np.inf, -1
+            self._device[-1], self._turn[-1] = -1, 0
+            self._queue(self._rows[q][-1], columns)
+
+    def _queue(self, run: int, columns: Codes) -> None:
+        self._phase[run, columns], self._entered[run, columns] = QUEUED, self._entries
+
     def _admit(self, q: int, columns: Codes) -> None:
-        """Begin a run where a token is and none runs; further tokens wait."""
-        tokens, phase = self._tokens[self._s.action_places[q], columns], self._phase[q, columns]
-        fresh = columns[(tokens > 0) & (phase == IDLE)]
-        if len(fresh):
-            self._start(q, fresh)
-        late = columns[(tokens > 1) & (phase == DONE)]
-        self._note_odd("queued", self._s.vocabulary.places[q], late)
+        """Begin runs while a server is free; further tokens wait."""
+        rows = self._rows[q]
+        while len(columns):
+            phase = self._phase[rows][:, columns]
+            free = (phase == GOING).sum(axis=0) < self._servers[q]
+            columns, phase = columns[free], phase[:, free]
+            waiting = np.where(phase == QUEUED, self._entered[rows][:, columns], _NEVER)
+            fresh = waiting.min(axis=0) < _NEVER
+            columns, first = columns[fresh], waiting[:, fresh].argmin(axis=0)
+            for i in np.unique(first):
+                self._start(rows[i], columns[first == i])
 
     def _grant(self) -> None:
         """Let runs begin whose device is free, in the order in which their tokens came."""
@@ -290,21 +383,22 @@ class Play:
             turn = np.where(mine & (self._turn > 0), self._turn, never)
             while (turn < never).any():
                 q = turn.argmin(axis=0)
-                begins = (turn[q, columns] < never) & (self._at_once[q] | ~busy)
+                begins = (turn[q, columns] < never) & (self._at_once[self._place[q]] | ~busy)
                 own, its = columns[begins], q[begins]
                 self._turn[its, own], self._came[its, own] = 0, self._now[own]
                 self._end[its, own] = self._now[own] + self._took[its, own]
                 busy |= begins
                 turn[q, columns] = never
 
-    def _cut(self, q: int, m: Move, counts: Counts, columns: Codes) -> None:
+    def _cut(self, m: Move, counts: Counts, rows: Codes, columns: Codes) -> None:
         """End runs that are taken while they are active: they count as the arc says. One that still
-        waits for its device never began, so it does not count."""
-        columns = columns[self._turn[q, columns] == 0]
+        waits for a server or its device never began, so it does not count."""
+        active = (self._phase[rows, columns] == GOING) & (self._turn[rows, columns] == 0)
+        rows, columns = rows[active], columns[active]
         status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
-        lasted = self._now[columns] - self._came[q, columns]
+        lasted = self._now[columns] - self._came[rows, columns]
         code = np.full(len(columns), self._s.vocabulary.outcome(status, m.number))
-        self._seen.note(q, columns, code, self._action[q, columns], lasted)
+        self._seen.note(self._place[rows], columns, code, self._action[rows, columns], lasted)
         self._good[columns] &= status <= SUCCESS
 
     def _note_odd(self, kind: str, name: str, columns: Codes) -> None:
@@ -312,8 +406,9 @@ class Play:
             known = self._odd.setdefault(kind, {}).setdefault(name, set())
             known.update(self._column[columns].tolist())
 
-    def _start(self, q: int, columns: Codes) -> None:
+    def _start(self, run: int, columns: Codes) -> None:
         """Choose an action and draw how its run will end."""
+        q = int(self._place[run])
         codes, bounds = self._choices[q]
         if not len(codes):
             raise ValueError(
@@ -325,18 +420,18 @@ class Play:
         ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
         status, taken = self._s.vocabulary.parts(ends.outcome)
         now = self._now[columns]
-        self._phase[q, columns] = GOING
-        self._status[q, columns], self._want[q, columns] = status, taken
-        self._preempted[q, columns], self._outcome[q, columns] = ends.preempted, ends.outcome
-        self._came[q, columns], self._end[q, columns] = now, now + ends.took
-        self._action[q, columns], self._took[q, columns] = action, ends.took
-        self._beyond[q, columns] = ends.beyond
+        self._phase[run, columns] = GOING
+        self._status[run, columns], self._want[run, columns] = status, taken
+        self._preempted[run, columns], self._outcome[run, columns] = ends.preempted, ends.outcome
+        self._came[run, columns], self._end[run, columns] = now, now + ends.took
+        self._action[run, columns], self._took[run, columns] = action, ends.took
+        self._beyond[run, columns] = ends.beyond
         device = self._device_of[action]
-        self._device[q, columns], self._turn[q, columns] = device, 0
+        self._device[run, columns], self._turn[run, columns] = device, 0
         waits = columns[device >= 0]
         if len(waits):
             self._turns += 1
-            self._turn[q, waits], self._end[q, waits] = self._turns, np.inf
+            self._turn[run, waits], self._end[run, waits] = self._turns, np.inf
 
     def _wait(self) -> Values:
         """Draw when the events of transitions that wait will come, as soon as they can serve them,
@@ -378,15 +473,15 @@ class Play:
 
     def _advance(self, due: Values) -> None:
         """On to the next end of a run or of a wait in each column."""
-        q = self._end.argmin(axis=0)
-        ends = self._end[q, np.arange(len(q))]
-        i = due.argmin(axis=0) if len(self._slow) else np.zeros(len(q), np.int64)
-        dues = due[i, np.arange(len(q))] if len(self._slow) else np.full(len(q), np.inf)
+        run = self._end.argmin(axis=0)
+        ends = self._end[run, np.arange(len(run))]
+        i = due.argmin(axis=0) if len(self._slow) else np.zeros(len(run), np.int64)
+        dues = due[i, np.arange(len(run))] if len(self._slow) else np.full(len(run), np.inf)
         soonest = np.minimum(ends, dues)
         moving = np.isfinite(soonest)
         self._now = np.where(moving, soonest, self._now)
         for number in range(len(self._end)):
-            self._end_runs(number, np.flatnonzero(moving & (ends <= dues) & (q == number)))
+            self._end_runs(number, np.flatnonzero(moving & (ends <= dues) & (run == number)))
         for number, move in enumerate(self._slow):
             columns = np.flatnonzero(moving & (dues < ends) & (i == number))
             if len(columns):
@@ -394,39 +489,44 @@ class Play:
                 self._fire(move, columns)
         self._free(np.flatnonzero(~moving))
 
-    def _end_runs(self, q: int, columns: Codes) -> None:
+    def _end_runs(self, run: int, columns: Codes) -> None:
         if not len(columns):
             return
-        self._end[q, columns] = np.inf
-        self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[q, columns]])
+        q = int(self._place[run])
+        self._end[run, columns] = np.inf
+        self._ends_so_far += 1
+        self._ended[run, columns] = self._ends_so_far
+        self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[run, columns]])
         self._seen.note(
-            q, columns, self._outcome[q, columns], self._action[q, columns], self._took[q, columns]
+            q,
+            columns,
+            self._outcome[run, columns],
+            self._action[run, columns],
+            self._took[run, columns],
         )
-        self._good[columns] &= self._status[q, columns] <= SUCCESS  # censored ones spoil nothing
-        cut = columns[self._preempted[q, columns]]
-        self._phase[q, columns] = DONE
-        self._phase[q, cut] = GOING
-        for number in np.unique(self._want[q, cut]):
-            own = cut[self._want[q, cut] == number]
+        self._good[columns] &= self._status[run, columns] <= SUCCESS  # censored ones spoil nothing
+        cut = columns[self._preempted[run, columns]]
+        self._phase[run, columns] = DONE
+        self._phase[run, cut] = GOING
+        for number in np.unique(self._want[run, cut]):
+            own = cut[self._want[run, cut] == number]
             able = (
                 self._enabled(self._s.moves[number])[own]
                 if number >= 0
                 else np.zeros(len(own), np.bool_)
             )
             if able.any():
-                self._fire(self._s.moves[number], own[able])
-            self._phase[q, own[~able]] = (
-                DONE  # what preempts it is not enabled: it ends by itself, with that status
-            )
+                self._fire(self._s.moves[number], own[able], cut=run)
+            # what preempts it is not enabled: it ends by itself, with that status
+            self._phase[run, own[~able]] = DONE
             self._note_odd("astray", self._s.moves[number].name, own[~able])
 
     def _free(self, stuck: Codes) -> None:
         """Nothing will happen in these columns: let the ended runs go any way that their status
         allows, else give up."""
-        for q, place in enumerate(self._s.vocabulary.places):
-            self._note_odd(
-                "beyond", place, stuck[(self._phase[q, stuck] == GOING) & self._beyond[q, stuck]]
-            )
+        for run, q in enumerate(self._place):
+            lasting = (self._phase[run, stuck] == GOING) & self._beyond[run, stuck]
+            self._note_odd("beyond", self._s.vocabulary.places[q], stuck[lasting])
         held = ((self._want[:, stuck] >= 0) & (self._phase[:, stuck] == DONE)).any(axis=0)
         self._want[:, stuck[held]] = -1
         dead = np.zeros(len(self._column), np.bool_)
@@ -445,7 +545,8 @@ class Play:
         verdicts = np.array(
             [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
         )
-        phase, want = self._phase[self._awaited], self._want[self._awaited]
+        awaited = self._awaited[self._place]
+        phase, want = self._phase[awaited], self._want[awaited]
         # an ended one whose measured transition is not enabled goes another way first: `_free`
         busy = ((phase == GOING) | ((phase == DONE) & (want >= 0))).any(axis=0)
         return np.where(busy, 0, verdicts[inverse.ravel()])
@@ -480,9 +581,5 @@ class Play:
         self._seen = self._seen.of(kept)
         for name in ("_column", "_replicate", "_now", "_begun", "_goals", "_good"):
             setattr(self, name, getattr(self, name)[kept])
-        for name in (
-            "_tokens", "_phase", "_status", "_want", "_preempted", "_end",
-            "_due", "_action", "_outcome", "_took", "_came", "_beyond", "_device", "_turn",
-            "_since",
-        ):  # fmt: skip
+        for name in (*_BY_RUN, "_tokens", "_due", "_since"):
             setattr(self, name, getattr(self, name)[:, kept])

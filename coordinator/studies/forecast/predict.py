@@ -62,6 +62,10 @@ NO_TRIALS = (
     "an estimates file contains no trials: successive runs of one trial are taken as independent, "
     "and nothing tests that; give a campaign's folder"
 )
+OTHER_FORM = (
+    "the campaign ran another form of this task: the figures come from the simulated net, and no "
+    "trial tests them; run a campaign of this form to test them"
+)
 NO_FIGURE: dict[str, Any] = {"value": None, "interval": None, "confidence": None}
 
 
@@ -106,7 +110,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     )
     _refuse_unmeasured(training, request.choices, asked)
     weights = trial_weights(training, request.choices)
-    straight = training.whole and (not asked or effective(weights) >= LEAST) and not request.net
+    straight = training.repeats and (not asked or effective(weights) >= LEAST) and not request.net
     random = np.random.default_rng(request.seed)
     found = (
         _from_trials(training, request, weights, random)
@@ -119,6 +123,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "training_trials": len(training.trials),
         "training_runs": len(training.runs),
         "whole": training.whole,
+        "same": training.same,
         "runs": request.runs,
         **found,
         "product": product_rule(training, request.choices),
@@ -133,8 +138,9 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
 
 def _by_place(training: Training, choices: Choices) -> dict[str, Any]:
     """Return how tokens left each place, in how many trials they came there, and how long the runs
-    of each action took. An estimates file tells none of them."""
-    if not training.whole:
+    of each action took. An estimates file tells none of them, nor do trials of another form of the
+    task."""
+    if not training.repeats:
         return {"routing": {}}
     laws = [
         {
@@ -185,7 +191,13 @@ def _never_entered(training: Training) -> list[str]:
     most = 1.0 - 0.05 ** (1.0 / len(training.trials))  # rule of three, exactly: (1 - p)^n = 5 %
     out = []
     for q, place in enumerate(training.vocabulary.places):
-        if q not in entered:
+        if q not in entered and not training.same:
+            out.append(
+                f"the campaign has no run in {place}: forecast with probability 0; its estimates "
+                "file tells runs by primitive task, whatever their place: --estimates "
+                "CAMPAIGN/estimates.db"
+            )
+        elif q not in entered:
             longest = task.primitive_task_of(place).deadline
             out.append(
                 f"no training run entered {place}: forecast with probability 0"
@@ -294,7 +306,7 @@ def _net_told(
 
 def _from_net(training: Training, request: Request, random: np.random.Generator) -> dict[str, Any]:
     net = _SimulatedNet(training)
-    residual = residuals(training, net.replayed(request.seed)) if training.whole else []
+    residual = residuals(training, net.replayed(request.seed)) if training.repeats else []
     whole = net.once(request.choices, request.point, random)
     samples = net.bootstrap(request, random)
     point, n = figures(whole), len(training.trials)
@@ -320,7 +332,11 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
             residual,
             net.runs,
             whole.endless / request.point,
-            [*net.structure.assumptions, *([] if training.whole else [NO_TRIALS])],
+            [
+                *net.structure.assumptions,
+                *([] if training.whole else [NO_TRIALS]),
+                *([] if training.same else [OTHER_FORM]),
+            ],
         ),
     }
 

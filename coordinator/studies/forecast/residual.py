@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import combinations
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -320,7 +320,7 @@ def rare_doubts(
     those that entered a place, or whose run left it by a certain transition."""
     time = measured(training).time
     kept = ~np.isnan(time) & (weights > 0)
-    if not training.whole or not kept.any():
+    if not training.repeats or not kept.any():
         return []
     groups: dict[frozenset[int], str] = {}
     for name, members in _branches(training).items():
@@ -421,11 +421,17 @@ def parallel_doubts(training: Training) -> list[str]:
     net, names = training.task.flat.net, training.vocabulary.places
     never = exclusive_places(net, place_semiflows(net))
     entered = sorted(net.place_index[names[q]] for q in set(training.runs.place.tolist()))
-    together = [pair for pair in combinations(entered, 2) if pair not in never]
+    several = {p for p in entered if training.task.flat.places[net.places[p]].most_active > 1}
+    together = [
+        (p, q)
+        for p, q in combinations_with_replacement(entered, 2)
+        if (p, q) not in never and (p != q or p in several)
+    ]
     more = f" (as {len(together) - 1} more pairs of places)" * (len(together) > 1)
     return [
-        f"{net.places[p]} and {net.places[q]} may run at the same time{more}, and an estimates "
-        "file does not tell whether they are slow, or fail, together; give a campaign's folder"
+        (f"several runs of {net.places[p]}" if p == q else f"{net.places[p]} and {net.places[q]}")
+        + f" may be active at the same time{more}, and an estimates file does not tell whether "
+        "they are slow, or fail, together; give a campaign's folder"
         for p, q in together[:1]
     ]
 
@@ -457,13 +463,6 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
             out.append(
                 f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
                 "not allow it: when a run is preempted depends on more than the run"
-            )
-    for place, n in sorted(played.queued.items()):
-        if n > NEGLIGIBLE * trials:
-            out.append(
-                f"in {n / trials:.1%} of the simulated trials a run that has ended stays in "
-                f"{place} while the next token waits there; the forecast begins the next run only "
-                "when it is taken, the engine at once"
             )
     for name, n in sorted(played.barred.items()):
         if n > NEGLIGIBLE * trials:

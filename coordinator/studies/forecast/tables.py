@@ -37,6 +37,7 @@ def forecast_text(made: Mapping[str, Any]) -> str:
             if said["whole"]
             else f"{said['training_runs']} runs of an estimates file"
         )
+        known += " of another form of this task" * (not said.get("same", True))
         how = "straight from them" if said["from"] == TRIALS else "by simulating the net"
         lines.append(f"  regime {name or '-'}: {said['runs']} new trials, from {known}, {how}")
         for figure, found in said["figures"].items():
@@ -96,7 +97,7 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
 def _worst(said: Mapping[str, Any]) -> str:
     residual = said["residual"]
     if not residual:
-        return "from an estimates file: no trials to compare with" if not said["whole"] else "none"
+        return "none" if said["whole"] and said.get("same", True) else "no trials to compare with"
     worst = min(residual, key=lambda row: row["p"])
     text = f"smallest p {worst['p']:.2f} ({worst['of']}) against the training trials"
     # the figures do not come from it, so a difference is not a doubt about them

@@ -318,7 +318,15 @@ def test_learned_choices_can_be_evaluated_again(conduct: Conduct) -> None:
 
     learnt = conduct("learnt", selector="thompson", runs=60, batch=12)
     (learnt.folder / "result.json").write_text(json.dumps(learnt.result()), encoding="utf-8")
-    best = learned_choices(learnt.folder)
+    name = learnt.result()["task"]
+    physics = read_manifest(learnt.folder).physics
+    best = learned_choices(learnt.folder, name, mock=False, physics=physics)
+    with pytest.raises(CampaignError, match=f"it learned in the task {name}, not in other"):
+        learned_choices(learnt.folder, "other", mock=False, physics=physics)
+    with pytest.raises(CampaignError, match="the new runs have scripted actions"):
+        learned_choices(learnt.folder, name, mock=True, physics=physics)
+    with pytest.raises(CampaignError, match="the new runs have actions in the physics 'portable'"):
+        learned_choices(learnt.folder, name, mock=False, physics="portable")
     assert set(best) == {"easy", "rough"}
     judged = conduct("judged", seed=2, options={"by_regime": best})
     for row in judged.table.rows():

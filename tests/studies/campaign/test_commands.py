@@ -25,6 +25,7 @@ from petrobot.coordinator.studies.campaign.conduct import (
     clock,
     line,
 )
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, write_manifest
 from petrobot.coordinator.studies.campaign.table import held, times
 from tests.processes import children
 from tests.studies.campaign.conftest import HERE, SERVICES, TASK
@@ -363,7 +364,8 @@ def test_choices_of_another_regime_are_no_learned_choices(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The first alternatives are not passed off as what was learned."""
-    result = {"selector": "thompson", "policy": {"easy": {}}}
+    write_manifest(tmp_path, CampaignPlan(str(TASK), str(SERVICES), 3, ("easy",), 1))
+    result = {"task": "fetch", "selector": "thompson", "policy": {"easy": {}}}
     (tmp_path / "result.json").write_text(json.dumps(result), encoding="utf-8")
     given = ["campaign", *TOY, "--regime", "easy,rough", "--learned", str(tmp_path)]
     assert main(given) == 2
