@@ -338,6 +338,7 @@ def held(folder: Path) -> Iterator[None]:
 
 TIMES = "times.csv"
 TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
+LONGEST_LINE = 1_000
 SESSIONS = "sessions.csv"
 SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 
@@ -349,10 +350,13 @@ def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
         block.index,
         *(result[name] for name in ("pid", "cpu_s", "wall_s", "mission_s", "rss_mb")),
     ]
-    # Without fsync: these costs are only reported, nothing depends on them.
-    rows = [took] if (folder / TIMES).exists() else [TIME_COLUMNS, took]
-    with (folder / TIMES).open("a", encoding="utf-8", newline="") as file:
-        file.write(_lines(rows))
+    # Without fsync: these costs are only reported. So a full disk or a power cut may have torn the
+    # last row, which is cut off.
+    with (folder / TIMES).open("a+b") as file:
+        begin = file.seek(max(0, file.tell() - LONGEST_LINE))
+        end = begin + file.read().rfind(b"\n") + 1
+        file.truncate(end)
+        file.write(_lines([took] if end else [TIME_COLUMNS, took]).encode())
 
 
 def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
@@ -363,7 +367,7 @@ def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
 
 def times(folder: Path) -> list[dict[str, str]]:
     """Return the costs of the blocks, in the order in which they ended; a block that was run again
-    is there twice."""
+    is there twice. A row that a full disk or a power cut has torn is left out."""
     return _read(folder / TIMES)
 
 
@@ -388,4 +392,4 @@ def _read(path: Path) -> list[dict[str, str]]:
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+        return list(csv.DictReader(line for line in file if line.endswith("\n")))
