@@ -239,16 +239,18 @@ class CampaignTable:
         return done
 
     def append(self, rows: Sequence[TrialRow]) -> None:
-        """Append the rows of a block; they are on disk when this returns."""
+        """Append the rows of a block; they are on disk when this returns. Raises OSError, also if
+        the table that has the blocks before it is gone."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
+        first = self._columns is None
         if self._columns is None:
             self._columns = columns(self._task, rows)
             writer.writerow(self._columns)
         for row in rows:
             writer.writerow(cells(self._task, row, self._columns))
-        first = not self.path.exists()
-        with self.path.open("ab") as file:
+        with self.path.open("xb" if first else "r+b") as file:
+            file.seek(0, os.SEEK_END)
             file.write(out.getvalue().encode("utf-8"))
             file.flush()
             os.fsync(file.fileno())

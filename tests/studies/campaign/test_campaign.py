@@ -79,6 +79,19 @@ def test_costs_that_a_full_disk_has_torn_do_not_end_a_resumed_campaign(
         assert all(float(row["rss_mb"]) == 120.0 for row in rows), left
 
 
+def test_a_table_that_is_gone_is_not_begun_again_in_the_middle(
+    conduct: Conduct, tmp_path: Path
+) -> None:
+    """It would be a file without a header and without the blocks before."""
+    table = conduct("done").table
+    rows = list(table.rows())
+    table.append(rows[:1])
+    (tmp_path / "done" / TABLE).unlink()
+    with pytest.raises(FileNotFoundError, match=TABLE):
+        table.append(rows[:1])
+    assert not (tmp_path / "done" / TABLE).exists()
+
+
 def test_blocks_of_any_size_cover_all_trials(toy_plan: CampaignPlan) -> None:
     """Regimes alternate and share their seeds; numbers and seeds depend only on the index."""
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
