@@ -237,8 +237,8 @@ def _written(folder: Path) -> Iterator[None]:
         yield
     except OSError as fault:
         text = (
-            f"{fault.filename or folder}: {fault.strerror or fault}; free some space and "
-            f"resume with --resume {folder}"
+            f"{fault.filename or folder}: {fault.strerror or fault}; put it back or free some "
+            f"space, and resume with --resume {folder}"
         )
         raise CommandError(2, text) from fault
 

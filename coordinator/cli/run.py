@@ -344,7 +344,13 @@ def conduct(
         again = f"correct that, then `petrobot resume {made[0].folder}` continues this run"
         raise CommandError(1, f"{fault}; {again}") from fault
     except (RequestError, DepartureError, EstimatesError, ReplayError, DirectoryError) as fault:
-        raise CommandError(2, str(fault)) from fault
+        done = bool(made) and made[0].mission.executor.finished is not None
+        again = (
+            f"; the run has ended: `petrobot resume {made[0].folder}` gives its result"
+            if (done and made[0].folder is not None)
+            else ""
+        )
+        raise CommandError(2, f"{fault}{again}") from fault
     [session] = made
     give(session, options, timeline)
     tidy(options, session.folder)

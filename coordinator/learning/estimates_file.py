@@ -68,10 +68,12 @@ BUSY = 20.0
 UNWRITABLE = {
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR,
     sqlite3.SQLITE_PERM,
     sqlite3.SQLITE_READONLY,
 }
-"""SQLite's primary result codes for a file that is not damaged."""
+"""SQLite's primary result codes for a file that is not damaged. A full disk is SQLITE_IOERR where
+the file of its shared memory cannot grow."""
 PHYSICS = "physics"
 """Row of the table `about`."""
 MOCK, SIMULATED, REAL = "mock", "simulated", "real"

@@ -15,6 +15,7 @@ import asyncio
 import importlib
 import logging
 import math
+import os
 import shutil
 import signal
 import threading
@@ -434,6 +435,10 @@ class LockstepSession(RunSession):
         """Do nothing: the cell has ended with the run."""
 
     async def _lead_cell(self, shell: SlicedCell) -> None:
+        with _kept_folder():
+            await self._run_cell(shell)
+
+    async def _run_cell(self, shell: SlicedCell) -> None:
         if self.operation is None:
             await shell.run(None)
             return
@@ -449,6 +454,18 @@ class LockstepSession(RunSession):
         assert self._member is not None
         self._member.open()
         self._member.run(lambda: self._party.over)
+
+
+@contextmanager
+def _kept_folder() -> Iterator[None]:
+    """Return to the working folder that an action has left: in lock step actions run in this
+    process, and what is written after the run has relative paths."""
+    folder = os.open(".", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield
+    finally:
+        os.fchdir(folder)
+        os.close(folder)
 
 
 @contextmanager

@@ -72,6 +72,7 @@ class JournalWriter:
         """Create a journal with a header or, without one, continue an existing file after its last
         good record."""
         self.path = path
+        self._at = path.absolute()  # an action in this process may change the working directory
         self._buffer = bytearray()
         self._unsynced = False
         """Whether records were handed to the operating system since the last sync."""
@@ -174,7 +175,7 @@ class JournalWriter:
 
     def flush(self) -> None:
         """Write what was appended to the file: it survives the end of this process, but not a power
-        cut."""
+        cut. Raises JournalError, also if the file is no longer where a resume would look for it."""
         if not self._buffer:
             return
         self._unsynced = True
@@ -185,10 +186,17 @@ class JournalWriter:
             # A full disk may take a part: another try continues after it.
             while self._buffer:
                 del self._buffer[: os.write(self._file, self._buffer)]
+            kept = self._at.exists() and os.path.samestat(os.fstat(self._file), self._at.stat())
         except OSError as fault:
             raise JournalError(
                 f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
             ) from fault
+        if not kept:
+            # Writing goes on in a file without a name, and no resume would ever find it.
+            raise JournalError(
+                f"{self.path}: removed, moved or replaced while its run was active; nothing was "
+                "sent on the strength of its last records; put it back"
+            )
 
     def sync(self) -> None:
         """Make all that was appended durable; does nothing if it already is."""

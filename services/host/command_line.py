@@ -7,6 +7,8 @@ raised here is printed as it is: `argument --runs: abc is not a whole number of 
 
 from __future__ import annotations
 
+import errno
+import io
 import logging
 import os
 import sys
@@ -15,7 +17,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from math import isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, ArgumentTypeError
@@ -39,9 +41,26 @@ def add_log_level(parser: ArgumentParser) -> None:
     )
 
 
+class _LogFile(io.FileIO):
+    """The file of standard error. What finds no room on its disk is lost: a driver that prints must
+    not end because of that."""
+
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as fault:
+            if fault.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise
+            return len(data)
+
+
 def log_to_stderr(level: int = logging.INFO) -> None:
     """Write log records of this level and above to the process's standard error, which is its
-    node's log."""
+    node's log. From now on a full disk raises no error there."""
+    stream = sys.__stderr__
+    if stream is not None and sys.stderr is stream:
+        file = io.BufferedWriter(_LogFile(stream.fileno(), "w", closefd=False))
+        sys.stderr = io.TextIOWrapper(file, stream.encoding, stream.errors, line_buffering=True)
     logging.basicConfig(
         format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=level
     )

@@ -18,6 +18,7 @@ written or is where petrobot is installed, in a folder of the user (`$XDG_STATE_
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import time
 from collections.abc import Iterable, Mapping
@@ -45,6 +46,11 @@ class Cleared(NamedTuple):
     """When the last one was cleared (`uptime`); 0: unknown, or before the last boot."""
     devices: Mapping[str, int] = {}
     """For each device the number of the stop that was last cleared for it."""
+
+    def since(self, device: str) -> float:
+        """Return how long ago a stop of the device was cleared, at the least (s); infinity: there
+        was none."""
+        return uptime() - self.at if device in self.devices else math.inf
 
 
 class Latch:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 
 from petrobot.services.host.emergency_latch import ALL, Cleared, Latch, LatchError, uptime
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
@@ -118,7 +119,18 @@ class EmergencyStops:
         freed = [d for d, n in self._counted.items() if last.get(d, 0) > n and d not in on_disk]
         self._stopped.difference_update(freed)
         self._counted |= dict.fromkeys(freed, self.cleared)
+        lost = self._stopped.difference(on_disk)
+        if lost and cleared == self._latch.cleared:  # not being cleared at this moment
+            self._store_again(self._latch, lost)
         return self._add(on_disk), freed
+
+    def _store_again(self, latch: Latch, devices: Collection[str]) -> None:
+        """Store a stop that the disk had no room for, or whose file was removed: this node knows of
+        it, and its successor must."""
+        with suppress(LatchError):  # reported when it was given; tried again at the next look
+            path = latch.stop(devices)
+            names = ", ".join(sorted(devices))
+            _log.warning("%s: stored again that %s stopped in emergency", path, names)
 
     def stop(self, devices: Collection[str]) -> str:
         """Stop these devices. Return why that could not be stored on disk; empty if it was."""
@@ -131,8 +143,8 @@ class EmergencyStops:
         except LatchError as fault:
             _log.error("an emergency stop could not be stored: %s", fault)
             return (
-                f"NOT STORED: {fault}; the devices are stopped until the node ends: do not start "
-                "it again before the cell is safe"
+                f"NOT STORED: {fault}; the node tries again; if it ends before, the devices may "
+                "move: do not start it again before the cell is safe"
             )
         return ""
 

@@ -4,6 +4,7 @@ streams."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import CanBus
@@ -105,9 +106,12 @@ class ProcessPorts(DevicePorts):
         clock: Callable[[], float],
         tickets: Mapping[str, str],
         keys: Sequence[bytes] = (),
+        cleared: float = inf,
     ) -> None:
+        """`cleared`: how long ago an emergency stop of the device was cleared (s)."""
         super().__init__(directory, device, clock)
         self._tickets = tickets
+        self._cleared = cleared
         self._key = tuple(keys) or None
         self._can: CanBus | None = None
         self._images: ImageSource | None = None
@@ -163,7 +167,12 @@ class ProcessPorts(DevicePorts):
             host = self._directory.nodes[self._device.node].host
             key = credentials(self._directory, self._device.node, self._key).stream_key(ticket)
             self._receiver = StreamReceiver(
-                self._device.name, self._incoming, host=host, key=key, clock=self._clock
+                self._device.name,
+                self._incoming,
+                host=host,
+                key=key,
+                clock=self._clock,
+                cleared=self._cleared,
             )
 
     def stream_ports(self) -> dict[str, int]:

@@ -523,12 +523,18 @@ def serve(
     try:
         directory = parse(setup.text, Path(setup.source))
         if link is None and setup.device:
+            latch = latch_of(directory.source, setup.node)
             ports = ProcessPorts(
-                directory, directory.devices[setup.device], monotonic, setup.tickets, setup.keys
+                directory,
+                directory.devices[setup.device],
+                monotonic,
+                setup.tickets,
+                setup.keys,
+                latch.cleared.since(setup.device),
             )
             driver = make_driver(directory, directory.devices[setup.device], ports)
             ports.draws.reseed(0)
-            guard = Guard(setup.device, latch_of(directory.source, setup.node))
+            guard = Guard(setup.device, latch)
             if driver.period:
                 node.post(
                     [

@@ -779,9 +779,10 @@ def test_a_task_may_draw_its_own_pictures() -> None:
         "sys.stdout.detach()",
         "sys.stdout = io.StringIO(); sys.stdout.close()",
         "import threading; threading.Thread(target=threading.Event().wait).start()",
+        "import os; os.chdir('/')",
     ],
 )
-def test_the_result_is_printed_although_an_action_takes_the_output_away(
+def test_the_result_is_given_although_an_action_takes_output_or_folder_away(
     tmp_path: Path, deed: str
 ) -> None:
     """In lock step the action runs in the process of the command. Later actions print, too. A

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,23 +55,11 @@ def _mounts() -> bool:
         return False
 
 
-@pytest.mark.parametrize("disk", DISKS)
-def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_path: Path) -> None:
-    if not _mounts():
-        pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
-    commands = [shlex.split(command) for command in COMMANDS]
-    result = shlex.quote(json.dumps({"status": "success"}))
-    steps = [
-        f"mount -t tmpfs -o size=96k none {tmp_path}",
-        f"cd {tmp_path}",
-        "mkdir ended",
-        f"cp {GOLDEN} run.journal",
-        "cp run.journal ended/",
-        f"echo {result} > ended/{RESULT}",
-        DISKS[disk].format(disk=tmp_path) + " || true",
-        f"exec {sys.executable} -B -m tests.cli.on_this_disk {shlex.quote(json.dumps(commands))}",
-    ]
-    given = ["unshare", "-rm", "bash", "-c", " && ".join(steps)]
+def _outcomes(steps: list[str], commands: list[str]) -> list[dict[str, Any]]:
+    """Run commands on a disk that these steps make, and return what each printed and left."""
+    told = shlex.quote(json.dumps([shlex.split(command) for command in commands]))
+    run = f"exec {sys.executable} -B -m tests.cli.on_this_disk {told}"
+    given = ["unshare", "-rm", "bash", "-c", " && ".join([*steps, run])]
     done = subprocess.run(
         given,
         env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin:/usr/sbin:/sbin"},
@@ -80,7 +69,25 @@ def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_pa
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2_000:]
-    found = json.loads(done.stdout.splitlines()[-1])
+    found: list[dict[str, Any]] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+@pytest.mark.parametrize("disk", DISKS)
+def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_path: Path) -> None:
+    if not _mounts():
+        pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
+    result = shlex.quote(json.dumps({"status": "success"}))
+    steps = [
+        f"mount -t tmpfs -o size=96k none {tmp_path}",
+        f"cd {tmp_path}",
+        "mkdir ended",
+        f"cp {GOLDEN} run.journal",
+        "cp run.journal ended/",
+        f"echo {result} > ended/{RESULT}",
+        DISKS[disk].format(disk=tmp_path) + " || true",
+    ]
+    found = _outcomes(steps, list(COMMANDS))
     for (command, name), outcome in zip(COMMANDS.items(), found, strict=True):
         said, where = outcome["said"].splitlines(), f"{disk}: petrobot {command}: {outcome}"
         told = [line for line in said if line.startswith(f"petrobot {command.split()[0]}: ")]
@@ -94,3 +101,26 @@ def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_pa
             word in told[0] for word in ("No space left", "Read-only", "is full", "unable to open")
         ), where
         assert [path for path in outcome["left"] if not path.endswith(".log")] == [], where
+
+
+@pytest.mark.parametrize("room", [12, 24, 64])
+def test_estimates_without_room_after_a_run_name_the_resume_that_gives_its_result(
+    room: int, tmp_path: Path
+) -> None:
+    """The journal has room, the estimates file has not: SQLite then fails in several ways."""
+    if not _mounts():
+        pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
+    steps = [
+        f"mount -t tmpfs -o size=400k none {tmp_path}",
+        f"cd {tmp_path}",
+        f"{sys.executable} -B -m petrobot.coordinator new robot carrier",
+        "cd carrier",
+        f"(cat /dev/zero > fill 2>/dev/null || true); truncate -s -{room}K fill",
+    ]
+    command = "run carrier.toml --mode lockstep --journal runs --learn e.db --quiet"
+    [outcome] = _outcomes(steps, [command])
+    assert outcome["code"] == 2 and "Traceback" not in outcome["said"], outcome
+    [said] = outcome["said"].splitlines()
+    assert said.startswith("petrobot run: e.db: "), outcome
+    assert "give --learn a file that can be written" in said, outcome
+    assert "; the run has ended: `petrobot resume runs/" in said, outcome

@@ -1,5 +1,5 @@
-"""A disk that becomes full during a run: one clear error, no effect without a record, and a resume
-that ends the run."""
+"""A disk that becomes full, or a journal that is taken away, during a run: one clear error, no
+effect without a record, and a resume that ends the run."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import shlex
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -75,3 +76,38 @@ def test_a_full_disk_ends_the_run_with_a_clear_error_and_loses_nothing(tmp_path:
         # the bell may ring between a run's start and its first step: then the run is reported as
         # not begun
         assert call in made or (end.status, end.executed) in NEVER_BEGUN, end
+
+
+def test_a_run_whose_journal_is_taken_away_ends_and_resumes_when_it_is_back(tmp_path: Path) -> None:
+    shuttle_services(tmp_path, fetch=0.2, carry=0.2, orphan=60.0)
+    runs = tmp_path / "runs"
+    given = ["--services", str(tmp_path / "services.toml"), "--journal", str(runs), *QUIET]
+    command = [sys.executable, "-m", "petrobot.coordinator", "run", str(TASK), "--runs", "8"]
+    up = nodes(tmp_path)
+    try:
+        with subprocess.Popen(
+            [*command, *given], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as run:
+            until = time.monotonic() + PATIENCE
+            while not moves(tmp_path, "end") and time.monotonic() < until:
+                time.sleep(0.02)
+            [folder] = runs.iterdir()
+            (folder / JOURNAL).rename(tmp_path / JOURNAL)
+            try:
+                _, said = run.communicate(timeout=PATIENCE)
+            finally:
+                run.kill()
+        assert run.returncode == 1, said
+        assert f"{JOURNAL}: removed, moved or replaced while its run was active" in said
+        assert "Traceback" not in said
+        assert not (folder / "result.json").exists()
+        (tmp_path / JOURNAL).rename(folder / JOURNAL)
+        resumed = petrobot(
+            tmp_path, "resume", str(folder), "--json", str(tmp_path / "out.json"), *QUIET
+        )
+        assert resumed.wait(PATIENCE) == 0, (tmp_path / "resume.txt").read_text()
+    finally:
+        up.terminate()
+        up.wait(PATIENCE)
+    assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
+    assert set(moves(tmp_path, "begin").values()) == {1} and not moves(tmp_path, "overlap")

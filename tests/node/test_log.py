@@ -163,6 +163,55 @@ async def test_a_node_logs_links_runs_restarts_and_commands(tmp_path: Path) -> N
     assert "DEBUG" not in log
 
 
+LOUD = """\
+import sys
+
+from petrobot import Driver, success
+
+class Loud(Driver):
+    period = 0.01
+
+    def step(self, now):
+        print("step", now, file=sys.stderr)
+
+    def stopped(self):
+        return True
+
+async def shout(ctx):
+    print("x" * 1_000_000, file=sys.stderr)
+    sys.stderr.flush()
+    return success()
+"""
+LOUD_CELL = """\
+schema = 1
+nodes.left = {{ host = "127.0.0.1", port = {port} }}
+devices.loud = {{ node = "left", driver = "loud:Loud" }}
+[actions]
+shout = {{ run = "loud:shout", device = "loud" }}
+alone = {{ run = "loud:shout", node = "left" }}
+"""
+
+
+@pytest.mark.processes
+async def test_a_log_on_a_full_disk_ends_no_driver_and_no_action(tmp_path: Path) -> None:
+    (tmp_path / "loud.py").write_text(LOUD)
+    (tmp_path / "left.log").symlink_to("/dev/full")
+    file = tmp_path / "services.toml"
+    file.write_text(LOUD_CELL.format(port=free_ports(1)[0]))
+    node = start_node("left", file)
+    try:
+        assert node.stdout is not None and "ready" in node.stdout.readline()
+        async with operator_of(parse(file.read_text(), file), "left") as operator:
+            for action in ("shout", "alone", "shout"):
+                assert (await operator.call(action)).status == "success", action
+            status = await operator.command("left", "status", "loud")
+            assert status.data["devices"]["loud"]["restarts"] == 0
+    finally:
+        node.terminate()
+        node.communicate(timeout=PATIENCE)
+    assert node.returncode == 0
+
+
 @pytest.mark.parametrize(("level", "shown"), [("debug", "DEBUG"), ("warning", "")])
 @pytest.mark.processes
 async def test_the_level_holds_for_the_node_and_its_processes(

@@ -191,11 +191,22 @@ class Nodes:
         self.file.write_text(text.format(left=left, right=right))
         self.directory = parse(self.file.read_text(), self.file)
         self.processes = {name: self._start(name, mock) for name in names}
-        for name, process in self.processes.items():
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            why = "" if line else process.communicate(timeout=PATIENCE)[1]
-            assert "ready" in line, f"{name}: {line!r} {why}"
+        for name in names:
+            self._await(name)
+
+    def _await(self, name: str) -> None:
+        process = self.processes[name]
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        why = "" if line else process.communicate(timeout=PATIENCE)[1]
+        assert "ready" in line, f"{name}: {line!r} {why}"
+
+    def restart(self, name: str) -> None:
+        """Kill a node and start it again."""
+        self.processes[name].kill()
+        self.processes[name].communicate(timeout=PATIENCE)
+        self.processes[name] = self._start(name, "")
+        self._await(name)
 
     def _start(self, name: str, mock: str) -> subprocess.Popen[str]:
         return start_node(name, self.file, *(["--mock", mock] if mock else []))

@@ -145,6 +145,48 @@ def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
     JournalWriter(path).close()
 
 
+def _removed(path: Path) -> None:
+    path.unlink()
+
+
+def _moved(path: Path) -> None:
+    path.parent.rename(path.parent.with_name("elsewhere"))
+
+
+def _replaced(path: Path) -> None:
+    path.with_name("copy").write_bytes(path.read_bytes())
+    path.with_name("copy").replace(path)
+
+
+@pytest.mark.parametrize("lost", [_removed, _moved, _replaced])
+def test_a_journal_that_is_lost_while_it_is_written_is_an_error(
+    tmp_path: Path, lost: Callable[[Path], None]
+) -> None:
+    """The open file can still be written and synced, but no resume would ever find it."""
+    path = tmp_path / "run" / "run.journal"
+    writer = JournalWriter(path, {})
+    writer.append("node", {})
+    writer.sync()
+    lost(path)
+    writer.append("node", {})
+    with pytest.raises(
+        JournalError, match=r"run\.journal: removed, moved or replaced.*put it back"
+    ):
+        writer.flush()
+
+
+def test_the_journal_of_a_process_that_changes_its_folder_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In lock step, actions run in the coordinator's process."""
+    monkeypatch.chdir(tmp_path)
+    writer = JournalWriter(Path("run.journal"), {})
+    monkeypatch.chdir("/")
+    writer.append("node", {})
+    writer.close()
+    assert len(read_journal(tmp_path / "run.journal").records) == 1
+
+
 def test_a_missing_record_is_refused(tmp_path: Path) -> None:
     """Every record is whole, but one is missing: later markings would be computed from a marking
     that never existed."""

@@ -3,6 +3,9 @@ how a node uses it."""
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -74,6 +77,30 @@ def test_a_stop_that_cannot_be_stored_is_reported_and_still_holds(tmp_path: Path
     assert (
         "remove this file by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
     )
+
+
+def test_a_stop_whose_file_is_gone_or_never_was_is_stored_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the next process of the node would move what this one holds stopped."""
+
+    def no_room(path: Path, content: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    one = latch(tmp_path)
+    stops = EmergencyStops(DEVICES, one)
+    stops.stop(["arm"])
+    for folder in tmp_path.iterdir():
+        shutil.rmtree(folder)
+    assert one.stopped() == frozenset()
+    assert stops.look(1.0) == ([], []) and latch(tmp_path).stopped() == {"arm"}
+    assert stops.clear(["arm"]) == "" and stops.look(2.0) == ([], [])
+    assert one.stopped() == frozenset() and one.cleared.number == 1
+    with monkeypatch.context() as full:
+        full.setattr("petrobot.services.host.emergency_latch.write_whole", no_room)
+        assert "the node tries again" in stops.stop(["arm"])
+        assert stops.look(3.0) == ([], []) and one.stopped() == frozenset()
+    assert stops.look(4.0) == ([], []) and one.stopped() == {"arm"}
 
 
 def test_a_node_that_cannot_store_a_latch_starts_stopped(

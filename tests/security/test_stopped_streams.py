@@ -11,7 +11,8 @@ import pytest
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.node_status import ask_all
 from petrobot.services.comm.location_file import Directory
-from tests.node.test_processes import Nodes, operator_of
+from tests.node.test_processes import Nodes, operator_of, pids
+from tests.processes import kill
 from tests.waiting import Limit, beat
 
 pytestmark = pytest.mark.processes
@@ -88,6 +89,42 @@ async def test_a_cart_that_follows_set_points_stands_still_until_a_new_run(tmp_p
             driving.cancel()
             await asyncio.gather(driving, return_exceptions=True)
         async with operator_of(nodes.directory, "right") as operator:
+            driving = asyncio.create_task(operator.call("drive"))
+            await until_it_moves(nodes.directory)
+            driving.cancel()
+            await asyncio.gather(driving, return_exceptions=True)
+    finally:
+        nodes.stop()
+
+
+@pytest.mark.parametrize("what", ["the driver's process", "its node"])
+async def test_a_process_that_starts_after_a_stop_was_cleared_bars_the_runs_from_before(
+    tmp_path: Path, what: str
+) -> None:
+    """What the former process had seen must not be forgotten with it."""
+    (tmp_path / "cart.py").write_text(CART)
+    nodes = Nodes(tmp_path, "left", "right", text=CELL)
+    estop = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path)]
+    try:
+        async with operator_of(nodes.directory, "left", "right") as operator:
+            driving = asyncio.create_task(operator.call("drive"))
+            await until_it_moves(nodes.directory)
+            assert await asyncio.to_thread(main, estop) == 0
+            assert await asyncio.to_thread(main, [*estop, "--clear"]) == 0
+            if what == "its node":
+                nodes.restart("left")
+            else:
+                former = (await pids(operator, "left", "cart"))["driver"]
+                kill([former])
+                limit = Limit("a new process")
+                while (await pids(operator, "left", "cart")).get("driver") in (None, former):
+                    limit.left()
+                    await beat(0.05)
+            for _ in range(3):  # the sender asks for the new address every 0.25 s
+                assert not await moves(nodes.directory), "by a run from before the stop"
+            assert not driving.done()
+            driving.cancel()
+            await asyncio.gather(driving, return_exceptions=True)
             driving = asyncio.create_task(operator.call("drive"))
             await until_it_moves(nodes.directory)
             driving.cancel()

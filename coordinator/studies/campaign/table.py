@@ -239,16 +239,18 @@ class CampaignTable:
         return done
 
     def append(self, rows: Sequence[TrialRow]) -> None:
-        """Append the rows of a block; they are on disk when this returns."""
+        """Append the rows of a block; they are on disk when this returns. Raises OSError, also if
+        the table that has the blocks before it is gone."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
+        first = self._columns is None
         if self._columns is None:
             self._columns = columns(self._task, rows)
             writer.writerow(self._columns)
         for row in rows:
             writer.writerow(cells(self._task, row, self._columns))
-        first = not self.path.exists()
-        with self.path.open("ab") as file:
+        with self.path.open("xb" if first else "r+b") as file:
+            file.seek(0, os.SEEK_END)
             file.write(out.getvalue().encode("utf-8"))
             file.flush()
             os.fsync(file.fileno())
@@ -338,6 +340,7 @@ def held(folder: Path) -> Iterator[None]:
 
 TIMES = "times.csv"
 TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
+LONGEST_LINE = 1_000
 SESSIONS = "sessions.csv"
 SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 
@@ -349,10 +352,13 @@ def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
         block.index,
         *(result[name] for name in ("pid", "cpu_s", "wall_s", "mission_s", "rss_mb")),
     ]
-    # Without fsync: these costs are only reported, nothing depends on them.
-    rows = [took] if (folder / TIMES).exists() else [TIME_COLUMNS, took]
-    with (folder / TIMES).open("a", encoding="utf-8", newline="") as file:
-        file.write(_lines(rows))
+    # Without fsync: these costs are only reported. So a full disk or a power cut may have torn the
+    # last row, which is cut off.
+    with (folder / TIMES).open("a+b") as file:
+        begin = file.seek(max(0, file.tell() - LONGEST_LINE))
+        end = begin + file.read().rfind(b"\n") + 1
+        file.truncate(end)
+        file.write(_lines([took] if end else [TIME_COLUMNS, took]).encode())
 
 
 def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
@@ -363,7 +369,7 @@ def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
 
 def times(folder: Path) -> list[dict[str, str]]:
     """Return the costs of the blocks, in the order in which they ended; a block that was run again
-    is there twice."""
+    is there twice. A row that a full disk or a power cut has torn is left out."""
     return _read(folder / TIMES)
 
 
@@ -388,4 +394,4 @@ def _read(path: Path) -> list[dict[str, str]]:
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+        return list(csv.DictReader(line for line in file if line.endswith("\n")))

@@ -377,7 +377,10 @@ class StreamReceiver:
         port: int = 0,
         key: Keys | None = None,
         clock: Callable[[], float] = time.monotonic,
+        cleared: float = math.inf,
     ) -> None:
+        """`cleared`: how long ago an emergency stop of the device was cleared (s): as after `bar`,
+        values count only of runs that began later."""
         require_key(name, host, key)
         self.faults = 0
         """How many connections broke the protocol or were refused."""
@@ -388,7 +391,7 @@ class StreamReceiver:
         self._clock = clock
         self._guests: dict[int, _Guest] = {}
         """Connections by the file number of their socket."""
-        self._barred_at = -math.inf
+        self._barred_at = clock() - cleared
         """When the device was last in emergency stop (s)."""
         self._ready = select.epoll()
         self._listener = socket.create_server(

@@ -39,7 +39,14 @@ from petrobot.coordinator.studies.campaign.summary import (
     comparisons,
     result_of,
 )
-from petrobot.coordinator.studies.campaign.table import TABLE, TrialRow, read_table
+from petrobot.coordinator.studies.campaign.table import (
+    TABLE,
+    TIMES,
+    TrialRow,
+    note_block,
+    read_table,
+    times,
+)
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.campaign.worker import serve
 from petrobot.coordinator.task import Kind
@@ -51,6 +58,38 @@ from tests.waiting import beat, until
 def table(folder: Path) -> bytes:
     """Return the table's bytes."""
     return (folder / TABLE).read_bytes()
+
+
+def test_costs_that_a_full_disk_has_torn_do_not_end_a_resumed_campaign(
+    toy_plan: CampaignPlan, tmp_path: Path
+) -> None:
+    """They are written without a sync, so any part of them may be lost."""
+    cost = {"pid": 7, "cpu_s": 0.5, "wall_s": 1.25, "mission_s": 2.0, "rss_mb": 120.0}
+    one, two, three = replace(toy_plan, runs=3, block=1).blocks
+    for block in (one, two):
+        note_block(tmp_path, block, cost)
+    whole = (tmp_path / TIMES).read_bytes()
+    for left in range(len(whole)):
+        (tmp_path / TIMES).write_bytes(whole[:left])
+        assert len(times(tmp_path)) == max(0, whole[:left].count(b"\n") - 1), left
+        note_block(tmp_path, three, cost)
+        kept = [str(index) for index in range(max(0, whole[:left].count(b"\n") - 1))]
+        rows = times(tmp_path)
+        assert [row["block"] for row in rows] == [*kept, "2"], left
+        assert all(float(row["rss_mb"]) == 120.0 for row in rows), left
+
+
+def test_a_table_that_is_gone_is_not_begun_again_in_the_middle(
+    conduct: Conduct, tmp_path: Path
+) -> None:
+    """It would be a file without a header and without the blocks before."""
+    table = conduct("done").table
+    rows = list(table.rows())
+    table.append(rows[:1])
+    (tmp_path / "done" / TABLE).unlink()
+    with pytest.raises(FileNotFoundError, match=TABLE):
+        table.append(rows[:1])
+    assert not (tmp_path / "done" / TABLE).exists()
 
 
 def test_blocks_of_any_size_cover_all_trials(toy_plan: CampaignPlan) -> None:
