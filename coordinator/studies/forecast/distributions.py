@@ -138,6 +138,32 @@ class ContextNode:
     """In a leaf of an outcome tree: the tree of the durations of each outcome."""
 
 
+def siblings(training: Training, place: str) -> list[str]:
+    """Return the places whose runs stand for those of a place that no run entered: those with the
+    same primitive task."""
+    names, task = training.vocabulary.places, training.task
+    entered = {names[q] for q in set(training.runs.place.tolist())}
+    wanted = task.primitive_task_of(place).name
+    return [p for p in names if p in entered and task.primitive_task_of(p).name == wanted]
+
+
+def lent_runs(training: Training, place: int) -> Runs:
+    """Return runs that stand for those of a place that no run entered. Which transition took a run
+    says nothing about another place: what preempted it cut it off there."""
+    names = training.vocabulary
+    lenders = [names.places.index(p) for p in siblings(training, names.places[place])]
+    runs = training.runs.of(np.isin(training.runs.place, lenders))
+    status, _ = names.parts(runs.outcome)
+    return replace(
+        runs,
+        place=np.full(len(runs), place),
+        outcome=np.array([names.outcome(int(s), -1) for s in status], np.int64),
+        preempted=np.zeros(len(runs), np.bool_),
+        censored=runs.censored | runs.preempted,
+        seen=Seen.nothing(len(names.places), len(runs)),
+    )
+
+
 class RunDistributions:
     """Outcome probabilities and duration distributions of all actions of one regime:
     `contexts[(place code, action code)]`."""
@@ -146,16 +172,18 @@ class RunDistributions:
         self.vocabulary = training.vocabulary
         self.contexts: dict[tuple[int, int], ContextNode] = {}
         self._numbers = 0
-        runs = training.runs
-        for key in sorted(set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))):
-            own = runs.of((runs.place == key[0]) & (runs.action == key[1]))
-            self.contexts[key] = self._grow(own, DEEPEST if unfold else 0, outcomes=True)
-        self.deadlines = {
-            place: _deadline(training, place, runs.of(runs.place == place))
-            for place in {place for place, _ in self.contexts}
-        }
+        self.deadlines: dict[int, tuple[float, int]] = {}
         """By place code: the longest time of a run there (s), and the outcome of one that is ended
         then."""
+        for place in range(len(self.vocabulary.places)):
+            own = training.runs.of(training.runs.place == place)
+            deepest = DEEPEST if unfold and len(own) else 0
+            own = own if len(own) else lent_runs(training, place)
+            for action in sorted(set(own.action.tolist())):
+                runs = own.of(own.action == action)
+                self.contexts[place, action] = self._grow(runs, deepest, outcomes=True)
+            if len(own):
+                self.deadlines[place] = _deadline(training, place, own)
 
     @property
     def count(self) -> int:

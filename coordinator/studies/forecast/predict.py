@@ -27,6 +27,7 @@ from petrobot.coordinator.studies.forecast.distributions import (
     Drawer,
     RunDistributions,
     dependences,
+    siblings,
 )
 from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
@@ -132,7 +133,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
         "asked": asked,
         "not_back": sum(t.completed and t.time is None for t in training.trials),
-        "notes": _never_entered(training),
+        "notes": _never_entered(training, straight),
     }
 
 
@@ -185,25 +186,26 @@ def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -
                     )
 
 
-def _never_entered(training: Training) -> list[str]:
-    """Note the action places that no training run entered, with what that is worth."""
+def _never_entered(training: Training, straight: bool) -> list[str]:
+    """Note the action places that no training run entered, with what that is worth, or with whose
+    runs the simulated net plays them."""
     entered, task = set(training.runs.place.tolist()), training.task
     most = 1.0 - 0.05 ** (1.0 / len(training.trials))  # rule of three, exactly: (1 - p)^n = 5 %
     out = []
     for q, place in enumerate(training.vocabulary.places):
-        if q not in entered and not training.same:
-            out.append(
-                f"the campaign has no run in {place}: forecast with probability 0; its estimates "
-                "file tells runs by primitive task, whatever their place: --estimates "
-                "CAMPAIGN/estimates.db"
+        if q in entered:
+            continue
+        longest, like = task.primitive_task_of(place).deadline, siblings(training, place)
+        if straight:
+            text = (
+                f"forecast with probability 0 (below {most:.2g} per trial, 95 %; runs of its "
+                f"deadline, {longest:g} s, would add up to {most * longest:.2g} s to the mean time)"
             )
-        elif q not in entered:
-            longest = task.primitive_task_of(place).deadline
-            out.append(
-                f"no training run entered {place}: forecast with probability 0"
-                + f" (below {most:.2g} per trial, 95 %; runs of its deadline, {longest:g} s, would "
-                f"add up to {most * longest:.2g} s to the mean time)" * training.whole
-            )
+        elif like:
+            text = f"its runs are taken to be like those of {' and '.join(like)}"
+        else:
+            text = "forecast with probability 0"
+        out.append(f"no training run entered {place}: {text}")
     return out
 
 

@@ -23,7 +23,7 @@ from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.residual import routing
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
-from tests.studies.forecast.conftest import TASK, Make
+from tests.studies.forecast.conftest import TASK, Make, with_transitions
 from tests.studies.forecast.test_preempting import ONE_WAY
 
 Write = Callable[..., Path]
@@ -220,12 +220,49 @@ def test_a_task_that_was_changed_is_forecast_by_the_simulated_net(
         "another place": ("net", False),
     }
     assert found["one action"]["choices"]["first"] == {"first_b": 1.0}
-    assert any("estimates.db" in note for note in found["another place"]["notes"])
+    (note,) = found["another place"]["notes"]
+    assert note == "no training run entered third: forecast with probability 0"
     assert not found["slower"]["doubts"] and not found["slower"]["residual"]
     assert any("another form" in text for text in found["slower"]["assumptions"])
     path.write_text(TASK.replace("first_", "other_").replace("second_a", "other_c"), "utf-8")
     assert main(["forecast", str(path), "--estimates", str(train), *QUICK]) == 2
     assert "no run of an action place and an action of" in capsys.readouterr().err
+
+
+def test_a_place_that_is_new_in_a_changed_task_is_played_with_runs_of_its_primitive_task(
+    write_campaign: Write, tmp_path: Path
+) -> None:
+    """A second try in a place of its own. 0.6 of the trials get through the first place, so 0.6 of
+    the others get through there."""
+    trials = [
+        Trial(
+            1, 0.0, 1.0 + (k % 5 < 3), True, int(k % 5 < 3),
+            runs=[
+                RunEntry("first", "first_a", 0.0, 1.0, "success" if k % 5 < 3 else "error"),
+                RunEntry("second", "second_a", 1.0, 1.0, "success", taken="done", cancelled=True),
+            ][: 1 + (k % 5 < 3)],
+        )
+        for k in range(300)
+    ]  # fmt: skip
+    train = write_campaign("train", TASK, trials)
+    again = with_transitions("""
+[places.again]
+kind = "action"
+task = "first"
+over: again:normal -> second
+gone: again:error -> free
+""")
+    path, out = tmp_path / "given.toml", tmp_path / "forecast.json"
+    off = 'in = ["first:error"]\nout = '
+    assert TASK.count(off + '["free"]') == 1
+    path.write_text(TASK.replace(off + '["free"]', off + '["again"]') + again, encoding="utf-8")
+    main(["forecast", str(path), "--estimates", str(train), *QUICK, "--json", str(out)])
+    said = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
+    assert said["notes"] == [
+        "no training run entered again: its runs are taken to be like those of first"
+    ]
+    assert said["figures"]["R_goal"]["value"] == pytest.approx(0.84, abs=0.02)
+    assert said["figures"]["mean"]["value"] == pytest.approx(0.6 * 2 + 0.4 * 2 + 0.24, abs=0.05)
 
 
 def test_estimates_of_another_task_are_refused(
