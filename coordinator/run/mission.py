@@ -114,11 +114,6 @@ class Cycle:
         """The worst status of its runs."""
         return self.worst[0]
 
-    @property
-    def cause(self) -> str:
-        """Its cause."""
-        return self.worst[1]
-
     def plain(self, now: float) -> dict[str, Any]:
         """Return plain data; times become ages (s), since only durations cross the wire."""
         ended = now if self.ended is None else self.ended

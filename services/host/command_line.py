@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from math import isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -36,6 +37,21 @@ def add_log_level(parser: ArgumentParser) -> None:
         default="info",
         help="log records of this level and above, to standard error (default: %(default)s; "
         "debug: also every message)",
+    )
+
+
+def add_member_options(parser: ArgumentParser) -> None:
+    """Add the options of every process of a cell."""
+    parser.add_argument(
+        "--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file"
+    )
+    parser.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
+    parser.add_argument(
+        "--await-coordinator",
+        type=number(least=0.0),
+        default=0.0,
+        metavar="S",
+        help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
     )
 
 
