@@ -99,7 +99,7 @@ def scripted_actions(mock: Path | None, directory: Directory) -> Substitutes | N
 
 
 def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:
-    """The task with so many tokens in its runs place (None: as many as the file says); gives that
+    """The task with `runs` tokens in its runs place (None: as the file says); gives that
     number too. A recorded expansion gets them as well."""
     place = task.places.get(task.runs_place) if task.runs_place else None
     if place is None:

@@ -21,9 +21,9 @@ from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededErro
 from petrobot.services.host.command_line import (
     LOG_LEVELS,
     add_log_level,
+    add_member_options,
     leave_threads,
     log_to_stderr,
-    number,
 )
 from petrobot.services.host.parent_death import die_with, wanted_with_parent
 from petrobot.services.node.realtime import serve
@@ -43,17 +43,7 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands.add_argument("name", help="the node's name in services.toml")
-    commands.add_argument(
-        "--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file"
-    )
-    commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
-    commands.add_argument(
-        "--await-coordinator",
-        type=number(least=0.0),
-        default=0.0,
-        metavar="S",
-        help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
-    )
+    add_member_options(commands)
     commands.add_argument(
         "--mock", metavar="FILE", default="", help="replace the actions that this file scripts"
     )

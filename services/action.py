@@ -141,7 +141,7 @@ class CommandRefused(Exception):  # noqa: N818 - as above
 
 
 class Context(Protocol[Device]):
-    """What a run may use besides its arguments. Times are seconds on the cell's clock, which
+    """What a run may use beside its arguments. Times are seconds on the cell's clock, which
     differs from host to host: send durations, never times.
 
     `Context[Scanner]` tells editors and type checkers the class of `ctx.device`; for a cyclic

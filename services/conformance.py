@@ -320,7 +320,7 @@ class _Check:
         until: Callable[[], bool] = lambda: False,
         positions: Mapping[str, float] | None = None,
     ) -> set[str]:
-        """Step for so long; return the positions that changed by more than at rest."""
+        """Step for `seconds`; return the positions that changed by more than at rest."""
         begin, drifted, end = self.numbers(), set[str](), self.now() + seconds
         while self.now() < end and not until():
             drifted |= _differ(begin, self.step(), positions or {}, PLAY)
@@ -594,7 +594,7 @@ class _Check:
         return positions, max(self.period, self.now() - begin - REST * self.period)
 
     def move(self, command: Command, seconds: float, judged: bool = True) -> Mapping[str, float]:
-        """Give a command and step for so long, or until the device stands still again; return how
+        """Give a command and step for `seconds`, or until the device stands still again; return how
         far each position moved."""
         if self.fresh:  # a new driver may need time
             for needed in (*self.first, command):
@@ -609,7 +609,7 @@ class _Check:
     def follow(
         self, command: Command, seconds: float, begin: dict[str, float], judged: bool = True
     ) -> Mapping[str, float]:
-        """Step for so long, or until the device stands still again; return how far each position
+        """Step for `seconds`, or until the device stands still again; return how far each position
         has moved since `begin`."""
         before = low = high = begin
         fastest, resting = dict[str, float](), 0

@@ -408,7 +408,7 @@ def _overridden(driver: type) -> set[str]:
 
 
 def numbers(value: Any, count: int, name: str) -> list[float]:
-    """Return a list of so many finite numbers. Raises ValueError with the name for anything
+    """Return a list of `count` finite numbers. Raises ValueError with the name for anything
     else."""
     fits = isinstance(value, list | tuple) and len(value) == count and all(map(_is_number, value))
     if not fits:

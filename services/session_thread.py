@@ -92,7 +92,7 @@ class SessionThread:
         self._news.append((kind, item))
 
     async def room(self) -> None:
-        """Wait until the driver has read most of what was told."""
+        """Wait until the driver has read most of the news."""
         while len(self._news) >= WAITING:
             await asyncio.sleep(0.01)
 

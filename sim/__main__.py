@@ -11,7 +11,12 @@ from pathlib import Path
 from petrobot.services.comm.location_file import Directory, DirectoryError, load, resolve
 from petrobot.services.comm.lockstep.mesh import CellError, run_member
 from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
-from petrobot.services.host.command_line import LOG_LEVELS, add_log_level, log_to_stderr, number
+from petrobot.services.host.command_line import (
+    LOG_LEVELS,
+    add_log_level,
+    add_member_options,
+    log_to_stderr,
+)
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import serve
 
@@ -27,17 +32,7 @@ def parser() -> argparse.ArgumentParser:
         "file, 3 the cell lost a party",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands.add_argument(
-        "--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file"
-    )
-    commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
-    commands.add_argument(
-        "--await-coordinator",
-        type=number(least=0.0),
-        default=0.0,
-        metavar="S",
-        help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
-    )
+    add_member_options(commands)
     commands.add_argument("--dry-run", action="store_true", help="serve nodes of a dry run")
     add_log_level(commands)
     return commands

@@ -4,8 +4,12 @@ without a limit."""
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar("T")
 
 PATIENCE_S = 60.0
 """How long a wait may last unless it says otherwise (s): more than a busy machine needs, less than
@@ -45,9 +49,25 @@ async def beat(seconds: float = 0.005) -> None:
     await over.wait()
 
 
-async def until(condition: Callable[[], object], awaited: str, seconds: float = PATIENCE_S) -> None:
+async def until(
+    condition: Callable[[], object], awaited: str = "a condition", seconds: float = PATIENCE_S
+) -> None:
     """Wait in the event loop until the condition is true. Raises AssertionError, as `Limit`
     does."""
     limit = Limit(awaited, seconds)
     while not condition() and limit.left():
         await beat()
+
+
+def wait_for(
+    condition: Callable[[], T | None], *steps: Callable[[], object], awaited: str = "a condition"
+) -> T:
+    """Call the steps until the condition is true, without an event loop; return what it is then.
+    Raises AssertionError, as `Limit` does."""
+    limit, pause = Limit(awaited), threading.Event()
+    while not (found := condition()) and limit.left():
+        for step in steps:
+            step()
+        pause.wait(0.002)
+    assert found
+    return found

@@ -198,7 +198,7 @@ def _raised_by(found: Analysis) -> Iterator[str]:
 
 
 def _deadlines(limits: SearchLimits, analyses: int) -> list[tuple[float | None, float | None]]:
-    """Return when each of so many analyses must end, and its search before that; None: no limit.
+    """Return when each of the analyses must end, and its search before that; None: no limit.
 
     Each gets the same share of the seconds.
     """

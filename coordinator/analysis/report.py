@@ -802,7 +802,7 @@ def _doubts(
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:
-    """Return two numbers with equally many digits: at least six, and enough to tell them apart."""
+    """Return two numbers with equally many digits: at least six, and enough to distinguish them."""
     texts = ((f"{one:#.{n}g}", f"{other:#.{n}g}") for n in range(6, 18))
     return next((pair for pair in texts if pair[0] != pair[1]), (f"{one:g}", f"{other:g}"))
 

@@ -372,7 +372,7 @@ def _plain(report: CheckReport, name: str) -> list[dict[str, Any]]:
 
 def _told(report: CheckReport, name: str) -> Iterator[Told]:
     """Yield the findings for people, each with the line of the task file that it is about. Of
-    several notes of one kind, the first is told, and how many there are."""
+    several notes of one kind, yield the first and their number."""
     path, known = task_path(name), set[str]()
     shown = path.name if str(path) != name else name  # that of a shipped task is long
     notes = Counter(f.code for f in report.findings if f.severity is Severity.NOTE)
@@ -424,7 +424,7 @@ def _text(
     name: str, judged: MayRun, report: CheckReport, missing: list[str], faults: list[str]
 ) -> Iterator[str]:
     """Yield the answer first, then the verdicts by name, then what was found, errors first.
-    `faults`: what is wrong in its files besides."""
+    `faults`: what else is wrong in its files."""
     from petrobot.coordinator.analysis.may_run import LATE
 
     analysis, told = judged.analysis, list(_told(report, name))

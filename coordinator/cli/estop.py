@@ -17,6 +17,7 @@ from petrobot.coordinator.cli.loading import (
     tell_of_demo,
     write_json,
 )
+from petrobot.coordinator.cli.options import add_runs_argument
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.emergency_stop import Stopped
@@ -46,13 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RUN",
         help="stop the cell of this run (default: the newest active run)",
     )
-    parser.add_argument(
-        "--journal",
-        metavar="FOLDER",
-        type=Path,
-        default=Path("runs"),
-        help="where runs are kept (default: %(default)s)",
-    )
+    add_runs_argument(parser)
     parser.add_argument(
         "--json", metavar="FILE", help="write the answers as JSON (- for standard output)"
     )

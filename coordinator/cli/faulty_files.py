@@ -1,4 +1,4 @@
-"""All faults of a task file or location file, and what can be judged of it in spite of them.
+"""All faults of a task file or location file, and what can still be judged.
 
 A reader stops after the first stage that finds faults: without TOML there are no keys, and wrong
 keys mean nothing. For `petrobot check` the data of the file is mended as its user would mend it,
@@ -28,7 +28,7 @@ STAND_INS = {
 }
 """Values for keys that an entry needs, in place of wrong and missing ones."""
 MISSPELLED = re.compile("unknown (key|table)")
-"""How the faults of keys begin that nobody knows."""
+"""Beginning of the faults that name an unknown key."""
 GROUPS = ("places", "transitions", "parameters")
 """Tables of a subnet."""
 

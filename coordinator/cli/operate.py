@@ -10,11 +10,11 @@ import hashlib
 import hmac
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.options import add_runs_argument
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -40,13 +40,7 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--run", metavar="RUN", help="a run's id or folder (default: the newest active run)"
     )
-    parser.add_argument(
-        "--journal",
-        metavar="FOLDER",
-        type=Path,
-        default=Path("runs"),
-        help="where runs are kept (default: %(default)s)",
-    )
+    add_runs_argument(parser)
     parser.add_argument(
         "--as",
         dest="name",

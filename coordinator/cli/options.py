@@ -169,6 +169,17 @@ def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_runs_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the option that names the folder of runs."""
+    parser.add_argument(
+        "--journal",
+        metavar="FOLDER",
+        type=Path,
+        default=Path("runs"),
+        help="where runs are kept (default: %(default)s)",
+    )
+
+
 def journal_folder(options: argparse.Namespace) -> Path | None:
     """Return the folder in which to keep this run; None if it is not kept."""
     from petrobot.coordinator.run.folder import DEFAULT

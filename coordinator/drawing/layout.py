@@ -304,8 +304,7 @@ def lay_out_blocks(
     block_of: Mapping[str, str], at: Mapping[str, Point], edges: Sequence[Edge]
 ) -> NodePositions:
     """Return a position for every node. Those of one block (`block_of`) stand together, and the
-    blocks lie to each other as `at` says; one without a position lies amid those it is joined
-    with."""
+    blocks lie as `at` says; one without a position lies between its neighbours."""
     members = defaultdict[str, list[str]](list)
     for name, block in block_of.items():
         members[block].append(name)

@@ -27,7 +27,7 @@ _SAMPLES = 24
 _LEVEL = 36.0
 """How far an arc may run level on both sides of a path point."""
 _AROUND = 80.0
-"""How far from its node a label may be, besides its own width."""
+"""Largest distance of a label from its node, in addition to its own width."""
 FONT = 12.5
 LINE = 15.0
 _CHARACTER = 0.565

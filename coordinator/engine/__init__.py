@@ -25,9 +25,7 @@ from petrobot.coordinator.engine.instructions import (
 )
 from petrobot.coordinator.engine.machine import Engine
 from petrobot.coordinator.engine.serialization import (
-    instruction_from_plain,
     point_from_plain,
-    state_from_plain,
     stimulus_from_plain,
     to_plain,
 )
@@ -117,9 +115,7 @@ __all__ = [
     "TimerFired",
     "VariableChanged",
     "Verdict",
-    "instruction_from_plain",
     "point_from_plain",
-    "state_from_plain",
     "stimulus_from_plain",
     "to_plain",
 ]

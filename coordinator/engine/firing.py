@@ -257,7 +257,7 @@ def in_words(draft: Draft, x: CompiledTransition) -> str:
 
 
 class Obstacle(NamedTuple):
-    """What keeps a transition from firing, apart from events and time. `place` is the place that
+    """What keeps a transition from firing, except events and time. `place` is the place that
     holds too few tokens or too many, or no run that the arc may take."""
 
     place: int | None

@@ -41,7 +41,7 @@ def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
 
 
 def remove_tokens(draft: Draft, policy: Policy, command: RemoveTokens) -> None:
-    """Take tokens out of a control place, if it has so many."""
+    """Take tokens out of a control place, if it has enough."""
     p = _control_place(draft, command.place, command.tokens)
     if p is None:
         return

@@ -1,5 +1,4 @@
-"""States, stimuli and instructions as plain data and back, for journals, snapshots and the
-operator's protocol.
+"""States, stimuli and instructions as plain data, and stimuli back, for journals and exports.
 
 A record becomes a mapping of its fields; a field at its default is left out. Stimuli and
 instructions carry their class name as `kind`. Reading checks every field against its annotation and
@@ -29,16 +28,17 @@ def to_plain(record: State | Stimulus | Instruction | Point) -> dict[str, Any]:
     return plain
 
 
-def state_from_plain(data: Mapping[str, Any]) -> State:
-    """Return the state that `to_plain` described. Raises ValueError with the first field that does
-    not fit."""
-    state: State = _reader(State)(data, "state")
-    return state
-
-
 def stimulus_from_plain(data: Mapping[str, Any]) -> Stimulus:
     """Return the stimulus that `to_plain` described. Raises ValueError."""
-    stimulus: Stimulus = _tagged(Stimulus, data)
+    if not isinstance(data, Mapping) or not isinstance(data.get("kind"), str):
+        raise ValueError("a record needs its `kind`")
+    cls = _KINDS.get(data["kind"])
+    if cls not in get_args(Stimulus):
+        raise ValueError(
+            f"{data['kind']!r} is none of {', '.join(c.__name__ for c in get_args(Stimulus))}"
+        )
+    given = {k: v for k, v in data.items() if k != "kind"}
+    stimulus: Stimulus = _reader(cls)(given, data["kind"])
     return stimulus
 
 
@@ -46,12 +46,6 @@ def point_from_plain(data: Mapping[str, Any]) -> Point:
     """Return the point that `to_plain` described. Raises ValueError."""
     point: Point = _reader(Point)(data, "point")
     return point
-
-
-def instruction_from_plain(data: Mapping[str, Any]) -> Instruction:
-    """Return the instruction that `to_plain` described. Raises ValueError."""
-    instruction: Instruction = _tagged(Instruction, data)
-    return instruction
 
 
 def _plain(value: Any) -> Any:
@@ -79,17 +73,6 @@ def _fields(record: Any) -> dict[str, Any]:
     return plain
 
 
-def _tagged(union: Any, data: Any) -> Any:
-    if not isinstance(data, Mapping) or not isinstance(data.get("kind"), str):
-        raise ValueError("a record needs its `kind`")
-    cls = _KINDS.get(data["kind"])
-    if cls not in get_args(union):
-        raise ValueError(
-            f"{data['kind']!r} is none of {', '.join(c.__name__ for c in get_args(union))}"
-        )
-    return _reader(cls)({k: v for k, v in data.items() if k != "kind"}, data["kind"])
-
-
 @cache
 def _reader(hint: Any) -> Reader:
     """Return a function that reads a value with this annotation."""
@@ -107,9 +90,7 @@ def _reader(hint: Any) -> Reader:
 
 
 def _union_reader(hint: Any) -> Reader:
-    if set(get_args(hint)) == set(get_args(Stimulus)):  # any other union here is `X | None`
-        return lambda value, where: _tagged(Stimulus, value)
-    inner = _reader(next(a for a in get_args(hint) if a is not type(None)))
+    inner = _reader(next(a for a in get_args(hint) if a is not type(None)))  # it is `X | None`
     return lambda value, where: None if value is None else inner(value, where)
 
 

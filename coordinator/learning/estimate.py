@@ -5,7 +5,7 @@ immutable and can be merged: the tally of two sets of runs is the merge of their
 several machines add up. Reliability R is the relative frequency of SUCCESS among the runs that were
 executed, not censored and judged (paper, section 3). An ERROR counts as not successful, also with
 `executed = unknown`. An ERROR of a run that never executed lowers only the availability A. A
-preempted run that counts `none` is censored: it only shows that the run lasted at least so long. A
+preempted run that counts `none` is censored: it only shows a least duration of the run. A
 run that ended provisionally and has no verdict says how such runs end and what they cost,
 but nothing about R.
 """

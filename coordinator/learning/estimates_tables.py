@@ -169,7 +169,7 @@ def plants(db: sqlite3.Connection) -> dict[str, str]:
 
 
 def fact(db: sqlite3.Connection, name: str) -> str:
-    """Return a value of the table `about`; "" if it is not there."""
+    """Return a value of the table `about`; "" if it is missing."""
     row = db.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
     return str(row[0]) if row else ""
 

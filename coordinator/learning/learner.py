@@ -354,7 +354,7 @@ class LearningSelector(FirstAlternative):
         self._latest = number
         for trial in [*self._open.values()]:
             if trial.met is None and trial.goals:
-                self._judge(now, trial, True)  # otherwise nobody can say whether it met the goal
+                self._judge(now, trial, True)  # otherwise it is unknown whether it met the goal
             if not self._tokens.on_its_way(trial.number):
                 # The task could take the next token, so this one is completed.
                 trial.completed = True
@@ -376,8 +376,8 @@ class LearningSelector(FirstAlternative):
 
     def _finished(self, now: float, finished: Finished) -> None:
         """Judge the last tokens if the task came to its end, also by `final_error`, or if the goal
-        was met before the end. What a run that somebody aborted would have come to is not known, so
-        it is censored; trials that were cut by the loss of another one are not recorded."""
+        was met before the end. The result of an aborted run is unknown, so it is
+        censored; trials that were cut by the loss of another one are not recorded."""
         success, lost = finished.status is Status.SUCCESS, self._tokens.lost(finished)
         for trial in [*self._open.values()]:
             gave_up = trial.number in lost and not self._aborted

@@ -134,7 +134,7 @@ class Comparison:
 
     @property
     def level_with_best(self) -> tuple[str, ...]:
-        """The other actions whose J cannot be told from the lowest one: the interval of the
+        """The other actions whose J may equal the lowest one: the interval of the
         difference contains 0, or is not known. The runs of two actions are taken as independent."""
         if self.best is None:
             return ()

@@ -20,7 +20,6 @@ Sources:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -36,29 +35,33 @@ from petrobot.coordinator.learning.batch import (
 )
 
 
-class Rule(Protocol):
+class Rule:
     """A learning rule has parameters but no state: all state is in the batch, and all randomness is
-    in the uniform numbers that the caller passes in."""
+    in the uniform numbers that the caller passes in. By default it draws and only counts."""
 
-    @property
-    def name(self) -> str:
-        """Name of the rule on the command line."""
+    name: str
+    """Name of the rule on the command line."""
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners without any experience."""
+        """Create learners without any experience, with all actions equally likely."""
+        return Batch.fresh(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return the probability of each action for the next choice, shape (rows, n)."""
+        raise NotImplementedError
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
         """Choose the next action of each row. `u`: uniform numbers in [0, 1), shape (rows, n).
         Changes nothing."""
+        return drawn(self.probabilities(batch, offered), u[:, 0])
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Learn from one trial of each row. Only eligible actions (None: all) may count as best."""
+        batch.counting(trial)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Explain in a few words why the first row would choose this action."""
+        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}"
 
 
 def forced(batch: Batch, offered: Mask, least: float) -> tuple[Mask, Index]:
@@ -79,14 +82,10 @@ def one_hot(action: Index, n: int) -> Array:
 
 
 @dataclass(frozen=True)
-class Fixed:
+class Fixed(Rule):
     """Always choose the first offered alternative."""
 
     name: str = "fixed"
-
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners; the rule needs no experience."""
-        return Batch.fresh(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return 1 for the first offered action."""
@@ -97,24 +96,16 @@ class Fixed:
         first: Index = np.argmax(offered, axis=1)
         return first
 
-    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Only count the trial."""
-        batch.counting(trial)
-
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Give no numbers: the choice does not depend on any."""
         return "the first alternative"
 
 
 @dataclass(frozen=True)
-class RoundRobin:
+class RoundRobin(Rule):
     """Choose the offered alternative that was chosen least often; the first of equals."""
 
     name: str = "round_robin"
-
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners without any choice counted."""
-        return Batch.fresh(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return the long-run shares, which are equal."""
@@ -124,10 +115,6 @@ class RoundRobin:
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
         """Choose the next action in turn."""
         return forced(batch, offered, np.inf)[1]
-
-    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Only count the trial."""
-        batch.counting(trial)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Say how often the action was chosen."""
@@ -169,7 +156,7 @@ def _learn(batch: Batch, trial: Response, eligible: Mask | None) -> None:
 
 
 @dataclass(frozen=True)
-class UCB1:
+class UCB1(Rule):
     """Choose the action with the largest mean payoff + sqrt(width * 2 ln k / n_a). The payoff is an
     affine function of J in [0, 1]."""
 
@@ -222,7 +209,7 @@ class UCB1:
 
 
 @dataclass(frozen=True)
-class Thompson:
+class Thompson(Rule):
     """Draw R of each action from its posterior Beta(1 + successes, 1 + other runs) and choose the
     lowest J. Costs enter as their means."""
 
@@ -280,7 +267,7 @@ def _plastic(n: int) -> float:
 
 
 @dataclass(frozen=True)
-class NikolicFu:
+class NikolicFu(Rule):
     """The scheme of the paper: estimate R and C of the chosen action, order all actions by J, and
     move p towards the best one: p_i += gamma_k (lambda_i - p_i), where lambda is 1 at the lowest J
     and 0 elsewhere, and gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
@@ -301,10 +288,6 @@ class NikolicFu:
     trials: int = 5
     even: float = 1.0
     focus: float = 2.0
-
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners with all actions equally likely."""
-        return Batch.fresh(rows, n, rho)
 
     def gain(self, k: Array) -> Array:
         """Return gamma at trial k."""
@@ -343,10 +326,6 @@ class NikolicFu:
         owed, least = forced(batch, offered, self.trials)
         return np.where(owed[:, None], one_hot(least, batch.n), mixed)
 
-    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """Draw an action from `probabilities`."""
-        return drawn(self.probabilities(batch, offered), u[:, 0])
-
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Update the estimates, order the actions by J, move p towards the best one."""
         batch.counting(trial)
@@ -364,7 +343,7 @@ class NikolicFu:
 
 
 @dataclass(frozen=True)
-class RewardInaction:
+class RewardInaction(Rule):
     """L_R-I: p of the chosen action grows by step * payoff * (1 - p) and the others shrink; without
     payoff nothing changes.
 
@@ -375,17 +354,9 @@ class RewardInaction:
     name: str = "reward_inaction"
     step: float = 0.02
 
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners with all actions equally likely."""
-        return Batch.fresh(rows, n, rho)
-
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return p over the offered actions."""
         return restricted(batch.p, offered)
-
-    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """Draw an action from `probabilities`."""
-        return drawn(self.probabilities(batch, offered), u[:, 0])
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Move p towards the chosen action in proportion to its payoff, unless that action is not
@@ -397,13 +368,9 @@ class RewardInaction:
             pay = pay * allowed
         batch.p += (self.step * pay)[:, None] * (one_hot(trial.action, batch.n) - batch.p)
 
-    def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Give the probability with which the action was drawn."""
-        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}"
-
 
 @dataclass(frozen=True)
-class DiscretisedPursuit:
+class DiscretisedPursuit(Rule):
     """DP_R-I: after each success, move p in steps of 1 / (n * resolution) towards the action with
     the lowest J.
 
@@ -414,19 +381,11 @@ class DiscretisedPursuit:
     resolution: int = 20
     trials: int = 10
 
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners with all actions equally likely."""
-        return Batch.fresh(rows, n, rho)
-
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return p over the offered actions; 1 for the action that still needs one of its first
         trials."""
         owed, least = forced(batch, offered, self.trials)
         return np.where(owed[:, None], one_hot(least, batch.n), restricted(batch.p, offered))
-
-    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """Draw an action from `probabilities`."""
-        return drawn(self.probabilities(batch, offered), u[:, 0])
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Move p towards the best estimate if the trial succeeded and all first trials are done."""
@@ -447,7 +406,7 @@ class DiscretisedPursuit:
         owed, _ = forced(batch, offered, self.trials)
         if owed[0]:
             return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}"
-        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}"
+        return super().says(batch, offered, action)
 
 
 # CUSUM sums of the change test: one for each direction of each observed quantity.
@@ -455,7 +414,7 @@ TESTS = ("success_up", "success_down", "cost_up", "cost_down")
 
 
 @dataclass(frozen=True)
-class Tracking:
+class Tracking(Rule):
     """The scheme of Nikolic and Fu for a changing world. It follows changes, and therefore does not
     converge with probability 1.
 
@@ -502,10 +461,6 @@ class Tracking:
         mixed = restricted(raised, offered)
         owed, least = forced(batch, offered, self.trials)
         return np.where(owed[:, None], one_hot(least, batch.n), mixed)
-
-    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """Draw an action from `probabilities`."""
-        return drawn(self.probabilities(batch, offered), u[:, 0])
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Fade the sums, update the estimates, test for a change, order the actions by J, move

@@ -32,7 +32,7 @@ class TrialTokens:
         self._fatal = {net.place_index[name] for name in named if name in net.place_index}
         taken = {p for arcs in net.consume for p, _ in arcs}
         self._sinks = set(range(len(net.places))) - taken - self._fatal
-        """Where a token stays for ever, such as a counter of products: it is on its way no more."""
+        """Places where a token stays for ever, such as a counter of products."""
         self._free = [*net.initial]
         """By place: its tokens of no trial."""
         self._waiting: defaultdict[int, deque[int]] = defaultdict(deque)

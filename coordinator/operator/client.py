@@ -39,7 +39,7 @@ class OperatorClient:
         self.who = ""
         """The name under which all others see this operator."""
         self.over = ""
-        """Why the connection has ended; empty while it is there."""
+        """Why the connection ended; empty while connected."""
         self._url = url
         self._headers = {"Authorization": f"Bearer {token}"}
         self._hello = {"type": "hello", "protocol": PROTOCOL, "name": name, "tab": secret}

@@ -1,4 +1,4 @@
-"""What operators see apart from the net: states of nodes and devices, camera images, ages of set
+"""What operators see beside the net: states of nodes and devices, camera images, ages of set
 points, learning, and what the trials so far say of the whole task.
 
 Nodes are polled a few times a second, only while a client is watching; their answers are published

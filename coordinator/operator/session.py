@@ -5,7 +5,7 @@ control their runs with it; `coordinator/operator/prepare.py` makes it from a re
 
 `prepare` opens the estimates and the journal of the run; `connect` reaches the nodes (real time);
 `operate` lets operators see and control it; `lead` runs it to its end, saves what was learned and
-closes the journal. A run that cannot be led after `prepare` is given up with `abandon`.
+closes the journal. `abandon` ends a run that cannot start after `prepare`.
 docs/decisions/one-session.md says what this replaced.
 """
 
@@ -131,7 +131,7 @@ class RunSession(ABC):
     async def connect(self) -> None:
         """Connect to every node. Raises UnreachableError, and MissionError if another run has a
         device of the task or if this was ordered before an emergency stop (only in real time: in
-        lock step the cell forms when it is led)."""
+        lock step the cell forms in `lead`)."""
 
     async def lead(self, watch: Watch | None = None) -> None:
         """Run it to its end; even if it fails, what was learned is saved and the journal is closed.
@@ -164,8 +164,8 @@ class RunSession(ABC):
         _log.info("run %s: finished, %s", self.identity, self.result()["status"])
 
     async def abandon(self) -> None:
-        """Give up a run that was not led: a new one leaves no folder, a resumed one stays as it
-        was. Does nothing after `lead`."""
+        """Give up a run before `lead`: a new one leaves no folder, a resumed one stays as it was.
+        Does nothing after `lead`."""
         if self._led:
             return
         self._led = True
@@ -348,7 +348,7 @@ class SlicedCell:
         JournalError, CellError."""
         told = begun = time.perf_counter()
         paused = 0.0  # wall time that the pace ignores
-        length = TELL if feed is None else SLICE  # without a page nobody waits for the loop
+        length = TELL if feed is None else SLICE  # without a page no client waits for the loop
         while not self._party.over:
             if self._fault is not None:
                 raise self._fault
@@ -429,7 +429,7 @@ class LockstepSession(RunSession):
                 await asyncio.to_thread(self._lead_member)
 
     async def connect(self) -> None:
-        """Do nothing: the cell forms when it is led."""
+        """Do nothing: the cell forms in `lead`."""
 
     async def _leave(self) -> None:
         """Do nothing: the cell has ended with the run."""

@@ -43,7 +43,7 @@ from petrobot.services.host.emergency_latch import uptime
 _log = logging.getLogger(__package__)
 
 FAULTS = (JournalError, ReplayError, TaskFileError, DirectoryError, EstimatesError, OSError)
-"""Exceptions of a start apart from ValueError and KeyError: faulty files."""
+"""Exceptions of a start, beside ValueError and KeyError, that mean faulty files."""
 LOOK, PATIENCE = 2.0, 1.5
 """Time between requests to idle nodes, and for their answers (s)."""
 LAST_WORDS = 10.0

@@ -42,7 +42,7 @@ class PageState:
     apart: BackgroundProcess = field(default_factory=BackgroundProcess)
     """Process for work on documents and journals."""
     analyses: BackgroundProcess = field(default_factory=BackgroundProcess)
-    """Process that analyses drawings, which takes so long that nothing else may wait for it."""
+    """Process that analyses drawings. This takes long, so no other work waits for it."""
     closing: bool = False
     _heard: dict[str, float] = field(default_factory=dict)
     _encoded: OrderedDict[tuple[int, int], str] = field(default_factory=OrderedDict)

@@ -100,32 +100,24 @@ def _xes_event(instruction: object) -> str | None:
             "lifecycle:transition": "complete",
             "kind": "run",
         }
-        status = "none" if instruction.status is None else instruction.status.value
-        reason = {"status": status, "cause": instruction.cause}
-        return _strings(
-            {
-                **names,
-                "concept:instance": instruction.run,
-                "org:resource": instruction.action,
-                **reason,
-            }
-        )
-    if isinstance(instruction, Corrected):
+    elif isinstance(instruction, Corrected):
         names = {
             "concept:name": f"verdict on {instruction.place}",
             "lifecycle:transition": "complete",
             "kind": "verdict",
         }
-        reason = {"status": instruction.status.value, "cause": instruction.cause}
-        return _strings(
-            {
-                **names,
-                "concept:instance": instruction.run,
-                "org:resource": instruction.action,
-                **reason,
-            }
-        )
-    return None
+    else:
+        return None
+    status = "none" if instruction.status is None else instruction.status.value
+    return _strings(
+        {
+            **names,
+            "concept:instance": instruction.run,
+            "org:resource": instruction.action,
+            "status": status,
+            "cause": instruction.cause,
+        }
+    )
 
 
 def _strings(values: dict[str, str]) -> str:

@@ -41,7 +41,7 @@ from petrobot.services.comm.protocol.messages import (
 
 _log = logging.getLogger(__package__)
 MOST_TOLD = 20_000
-"""Most entries of cycles, and of their open runs, that a score is told: 3,333 cycles without open
+"""Most entries of cycles, and of their open runs, that a score receives: 3,333 cycles without open
 runs. A message carries little more (docs/protocol.md)."""
 KEPT = 5_000
 """Least number of the newest cycles and runs that are kept, for a score and for verdicts that come
@@ -113,11 +113,6 @@ class Cycle:
     def status(self) -> Status:
         """The worst status of its runs."""
         return self.worst[0]
-
-    @property
-    def cause(self) -> str:
-        """Its cause."""
-        return self.worst[1]
 
     def plain(self, now: float) -> dict[str, Any]:
         """Return plain data; times become ages (s), since only durations cross the wire."""
@@ -403,7 +398,7 @@ class Mission:
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
         """Return the result as the command line writes it; the keys of the score stand beside the
         general ones. `last_errors` says why actions ended in ERROR, also those that the task
-        recovered from. `last_failure` is there if the task ended in ERROR and no action did."""
+        recovered from. `last_failure` is set if the task ended in ERROR and no action did."""
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
         errors = self.tally.last_errors(self.executor.directory)

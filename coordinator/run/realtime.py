@@ -37,7 +37,7 @@ PERIOD: Final = 0.05
 LATE: Final = 0.02
 """Delay from which a check counts as late (s): a period of a set-point stream at 50 Hz."""
 SHARE: Final = 0.01
-"""Share of late checks from which the host counts as too busy for a run in real time."""
+"""At this share of late checks the host counts as too busy for a run in real time."""
 WORST: Final = 3 * LATE
 """Single delay (s) from which it counts as too busy: a set point of such a stream is stale then."""
 STOOD_STILL: Final = 2.0

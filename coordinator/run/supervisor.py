@@ -24,11 +24,11 @@ _log = logging.getLogger(__package__)
 PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
 FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 8.0
-# for the rest of what an ended program has said (s); what it has left running may never stop
+# for the last output of an ended program (s); processes that it left running may never stop
 # talking
 LAST_WORDS = 0.5
 READY = b"ready"  # what a program prints when others may use it
-STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
+STABLE_AFTER = 10.0  # after this uptime (s) a node starts again without a pause
 
 
 class LaunchError(Exception):

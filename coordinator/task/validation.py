@@ -212,7 +212,7 @@ def _time(key: str, seconds: float) -> Iterator[Fault]:
 
 
 class _Names:
-    """What arguments, results and arcs of one net may name besides its own places."""
+    """What arguments, results and arcs of one net may name beside its own places."""
 
     def __init__(self, task: Task, subnet: Subnet | None = None) -> None:
         parameters = {} if subnet is None else subnet.parameters

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from math import isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -52,6 +53,21 @@ class _LogFile(io.FileIO):
             if fault.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise
             return len(data)
+
+
+def add_member_options(parser: ArgumentParser) -> None:
+    """Add the options of every process of a cell."""
+    parser.add_argument(
+        "--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file"
+    )
+    parser.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
+    parser.add_argument(
+        "--await-coordinator",
+        type=number(least=0.0),
+        default=0.0,
+        metavar="S",
+        help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
+    )
 
 
 def log_to_stderr(level: int = logging.INFO) -> None:

@@ -91,7 +91,7 @@ class Latch:
         raise LatchError("; ".join(faults))
 
     def clear(self, devices: Iterable[str], all_devices: Iterable[str]) -> None:
-        """Allow these devices to move again; `all_devices` is what `ALL` stands for. Raises
+        """Allow these devices to move again; `ALL` means `all_devices`. Raises
         LatchError, and then nothing is cleared."""
         stopped = self.stopped()
         named = set(all_devices) if ALL in stopped else set(stopped)

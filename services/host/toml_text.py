@@ -56,7 +56,7 @@ def read_toml(text: str | bytes, source: str) -> dict[str, Any]:
 
 
 def shortened(fault: str) -> str:
-    """Return the text of a fault without the middle of one that nobody would read."""
+    """Return the text of a fault without the middle of a very long one."""
     if len(fault) <= LONGEST:
         return fault
     return f"{fault[: LONGEST // 2]} ... {fault[-LONGEST // 2 :]}"

@@ -97,26 +97,19 @@ class ScanGrid:
     """`x` as plain numbers."""
 
     @staticmethod
-    def of(
-        view: FloorView,
-        far: float,
-        spacing: float = 0.03,
-        step: float = 0.00625,
-        reach: float = 0.6,
-    ) -> ScanGrid:
-        """Choose image rows about `spacing` apart on the floor up to `far`, sampled every `step` to
-        `reach` on both sides (m)."""
+    def of(view: FloorView, far: float) -> ScanGrid:
+        """Choose image rows 3 cm apart on the floor up to `far`, sampled every 6.25 mm to
+        60 cm on both sides (m)."""
         distances = view.distances()
         rows, last = [], -math.inf
         for row in range(view.height - 1, -1, -1):
             if distances[row] > far:
                 break
-            if distances[row] - last >= spacing - 0.5 * _growth(distances, row):
+            if distances[row] - last >= 0.03 - 0.5 * _growth(distances, row):
                 rows.append(row)
                 last = distances[row]
         x = distances[rows]
-        count = round(reach / step)
-        y = np.arange(-count, count + 1, dtype=np.float64) * np.float64(step)
+        y = np.arange(-96, 97, dtype=np.float64) * np.float64(0.00625)
         u, _ = view.pixels(x[:, None], y[None, :])
         seen = (u >= 0.0) & (u <= view.width - 1.001)
         u = np.clip(u, 0.0, view.width - 1.001)

@@ -11,7 +11,7 @@ from typing import Final
 from petrobot.services.mobile.track_map import Fit
 
 Look = Callable[[float], Fit | None]
-"""Function that returns the line so many metres ahead, body frame; None where it is not known."""
+"""Function that returns the line this many metres ahead, body frame; None where unknown."""
 
 TIGHTEST: Final = 4.0
 """1/m: the greatest curvature that is driven."""

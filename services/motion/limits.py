@@ -227,7 +227,7 @@ NEAR = 0.02
 """rad of braking below which the path to rest is too short to need a check at its middle; 10 mm at
 the cup."""
 LOOKS = (0.25, 0.5)
-"""Shares of the braking time at which a long path to rest is checked, besides its beginning and its
+"""Shares of the braking time at which a long path to rest is checked, beside its beginning and its
 end; `clear_step` uses the same."""
 JOINT_SLACK = 1e-6
 """How far rounding may carry a command beyond a joint limit (rad)."""

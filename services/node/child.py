@@ -129,7 +129,7 @@ class Child:
         self._loop = asyncio.get_running_loop()
         self._logs = _log.isEnabledFor(logging.DEBUG)
         self.last_word = b""
-        """What its process said as it ended: LINK_LOST, NO_MEMORY, or empty."""
+        """What its process reported as it ended: LINK_LOST, NO_MEMORY, or empty."""
         self.pipe, pipe_end = pipe_pair()
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         counter = permit_counter()
@@ -303,7 +303,7 @@ class Child:
         await self._forked.wait()
         if self._keeper:
             await until_ended(self._keeper)
-            self._code = self.code  # so it is reaped, though nobody may ask for it
+            self._code = self.code  # so it is reaped, even if no caller asks for it
         else:
             self._code = -signal.SIGKILL
             self._killed = self._killed or "its fork server ended, or could not fork it"

@@ -106,8 +106,8 @@ class EmergencyStops:
     def look(self, now: float) -> tuple[list[str], list[str]]:
         """Return the devices that the latch has stopped since the last call, and those that another
         process has cleared, because this one did not answer. Perhaps only a process of the device
-        has seen that stop, or nobody: runs that began before it are active, and none that began
-        later, since the node looks before each run."""
+        saw that stop, or none did; so runs that began before it are active. None began later, since
+        the node looks before each run."""
         if self._latch is None:
             return [], []
         self.due = now + LOOK if self._devices else NEVER

@@ -473,7 +473,7 @@ class Node:
 
     def _has_ended(self, run: object) -> bool:
         """Whether a run that is to be held is not active any more: a hold would catch the next run,
-        which nobody would release."""
+        which would never be released."""
         return isinstance(run, str) and self.callee.service_of(run) is None
 
     def stopped_in_emergency(self) -> tuple[str, ...]:

@@ -71,16 +71,15 @@ class Surface:
     noise: float = 0.0005
 
     @classmethod
-    def of(cls, cell: Mapping[str, Any], spread: float = 0.30) -> Surface:
-        """Read the cell's data; `spread`: the rolling resistance is uniform within +- this share of
-        the nominal."""
+    def of(cls, cell: Mapping[str, Any]) -> Surface:
+        """Read the cell's data; the rolling resistance is uniform within +- 30 % of the nominal."""
         table, ball = cell["table"], cell["ball"]
         rolling = float(ball["rolling_resistance"]) * float(ball["gravity"])
         return cls(
             float(table["near_edge"]),
             float(table["width"]) / 2.0,
             rolling,
-            spread / np.sqrt(3.0) * rolling,
+            0.30 / np.sqrt(3.0) * rolling,
         )
 
     def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, ExitWay]:

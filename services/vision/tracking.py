@@ -134,7 +134,7 @@ class _Chase:
         self._sights: list[tuple[float, float, float]] = []
         """Time (s) and place (m) of each sight."""
         self._latencies: list[float] = []
-        """Time from the middle of an exposure to the set point that it led to (s)."""
+        """Time from the middle of an exposure to its set point (s)."""
         self._images = self._seen = self._misses = self._otherwise = 0
         self._seen_at = 0.0
         self._located = (0.0, 0.0, 0.0)

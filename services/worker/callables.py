@@ -25,7 +25,7 @@ _LIBRARY = f"{Path(os.__file__).parent}/"
 LONGEST = 2_000
 """Longest description (characters): an exception may quote all of the data that it is about."""
 FRAMES, CHAIN = 50, 8
-"""Most frames of one traceback in the log, and most exceptions that led to one another."""
+"""Most frames of one traceback in the log, and most exceptions in a chain of causes."""
 RAISED = (Exception, SystemExit, GeneratorExit)
 """What code of a driver may raise: a library of its vendor may call `sys.exit`. (KeyboardInterrupt
 may be a Ctrl-C.)"""

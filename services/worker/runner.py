@@ -259,7 +259,7 @@ def _watch_unawaited() -> None:
     if sys.unraisablehook is not _note_unawaited:
         global _usual_hook
         _usual_hook, sys.unraisablehook = sys.unraisablehook, _note_unawaited
-    # As an error it is raised where the coroutine is dropped: nobody can catch it there.
+    # As an error it is raised where the coroutine is dropped: no code can catch it there.
     warnings.filterwarnings("error", "coroutine .* was never awaited", RuntimeWarning)
 
 
@@ -293,8 +293,8 @@ class DeviceControl(Protocol):
 
 
 class Runner:
-    """Runs of one place: of one device, at most one at a time (besides those that start at once),
-    or of none, any number.
+    """Runs of one place: of one device, at most one at a time (except those that start at once);
+    without a device, any number.
 
     Orders come in by `take`, reports go out by `reports`; in between `advance(now)` does what is
     due. `clock` is what `ctx.now` reads. `substitutes` replace actions by other callables. With

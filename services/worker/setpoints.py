@@ -175,7 +175,7 @@ class Outlets:
 # what cannot be sent now.
 
 ASK_AGAIN = 0.25
-"""Time between two requests for the address of a receiver that is not there (s)."""
+"""Time between two requests for the address of an absent receiver (s)."""
 
 
 class StreamOutlets:

@@ -26,7 +26,7 @@ from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task.file import loads
 from tests.cli.cell import TASK, Arm, RobotNode, directory_in
-from tests.waiting import beat
+from tests.waiting import until
 
 RUN = "reaching-1"
 
@@ -91,17 +91,11 @@ class Terminal:
         said = self._read()
         return Said(code, said.out, said.err)
 
-    async def until(self, holds: Callable[[], bool], timeout: float = 60.0) -> None:
-        """Wait until something holds."""
-        async with asyncio.timeout(timeout):
-            while not holds():
-                await beat(0.002)
-
     async def working(self, *options: str) -> None:
         """Lead the run to where the arm reaches."""
         said = await self("raise", "part_there", *options)
         assert said.code == 0, said.err
-        await self.until(lambda: self.arm.moving)
+        await until(lambda: self.arm.moving)
 
 
 @asynccontextmanager

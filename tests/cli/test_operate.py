@@ -29,7 +29,7 @@ from petrobot.coordinator.run.recording import remarks
 from petrobot.services.comm.location_file import load
 from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
-from tests.waiting import beat
+from tests.waiting import beat, until
 
 STEERING = ["watch", *(one.name for one in COMMANDS if one.home.startswith("operate:"))]
 
@@ -44,7 +44,7 @@ async def test_pause_reaches_the_devices_and_continue_releases_them(petrobot: Te
     assert (again.code, again.json["nodes"]) == (0, {"robot": "held"})
     said = await petrobot("continue")
     assert said.code == 0 and "continues" in said.out
-    await petrobot.until(lambda: not petrobot.arm.held)
+    await until(lambda: not petrobot.arm.held)
     said = await petrobot("continue")
     assert said.code == 1 and "nothing to continue: the mission run is running" in said.err
 
@@ -144,8 +144,8 @@ async def test_an_abort_releases_held_devices(petrobot: Terminal) -> None:
     await petrobot("pause")
     assert petrobot.arm.held
     assert (await petrobot("abort")).code == 0
-    await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
-    await petrobot.until(lambda: not petrobot.arm.held)
+    await until(lambda: petrobot.mission.executor.finished is not None)
+    await until(lambda: not petrobot.arm.held)
 
 
 async def test_step_fires_once(petrobot: Terminal) -> None:
@@ -156,18 +156,18 @@ async def test_step_fires_once(petrobot: Terminal) -> None:
     said = await petrobot("step", "--json", "-")
     assert said.json["firing"]["transition"] == "start"
     assert petrobot.tokens("work") == 1
-    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
+    await until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
 
 
 async def test_breakpoints(petrobot: Terminal) -> None:
     """They are set, listed, reached and removed."""
     assert "start" in (await petrobot("break", "start")).out
     await petrobot("raise", "part_there")
-    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
+    await until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
     assert (await petrobot("break", "--json", "-")).json["breakpoints"] == ["transitions.start"]
     assert (await petrobot("break", "start", "--off", "--json", "-")).json["breakpoints"] == []
     await petrobot("continue")
-    await petrobot.until(lambda: petrobot.arm.moving)
+    await until(lambda: petrobot.arm.moving)
 
 
 async def test_tokens_can_be_changed_in_control_places_only(petrobot: Terminal) -> None:
@@ -186,8 +186,8 @@ async def test_a_forced_transition_ends_a_hanging_action(petrobot: Terminal) -> 
     await petrobot.working()
     said = await petrobot("force", "work", "done")
     assert said.code == 0, said.err
-    await petrobot.until(lambda: petrobot.tokens("arm_free") == 1 and not petrobot.arm.moving)
-    await petrobot.until(lambda: bool(petrobot.mission.tally.runs))
+    await until(lambda: petrobot.tokens("arm_free") == 1 and not petrobot.arm.moving)
+    await until(lambda: bool(petrobot.mission.tally.runs))
     assert [record.status for record in petrobot.mission.tally.runs] == [None]
 
 
@@ -198,7 +198,7 @@ async def test_the_operator_chooses_the_alternative(petrobot: Terminal) -> None:
     assert petrobot.acting == ["reach_slowly"]
     assert (await petrobot("override", "work", "--free")).code == 0
     petrobot.arm.arrive()
-    await petrobot.until(lambda: petrobot.tokens("arm_free") == 1)
+    await until(lambda: petrobot.tokens("arm_free") == 1)
     await petrobot.working()
     assert petrobot.acting == ["reach"]
 
@@ -248,10 +248,10 @@ async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
     """The reason names the operator."""
     watching = asyncio.create_task(petrobot("watch"))
-    await petrobot.until(lambda: petrobot.operation.feed.watched)
+    await until(lambda: petrobot.operation.feed.watched)
     await petrobot.working("--as", "ana")
     assert (await petrobot("abort", "--as", "ana")).code == 0
-    await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
+    await until(lambda: petrobot.mission.executor.finished is not None)
     finished = petrobot.mission.executor.finished
     assert finished is not None and "ana" in finished.reason
     lines = (await watching).out.splitlines()
@@ -269,13 +269,13 @@ async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal)
     assert (node["node"], node["devices"], node["bus"]) == ("robot", {"arm": "stopped"}, "")
     assert said.json["coordinator"] == f"{RUN}: aborted"
     assert petrobot.arm.quick_stops and not petrobot.arm.moving
-    await petrobot.until(lambda: petrobot.mission.executor.finished is not None)
+    await until(lambda: petrobot.mission.executor.finished is not None)
     reached = petrobot.shell.clients["robot"]
     refused = await reached.call("reach")
     assert (refused.cause, refused.executed) == ("emergency_stop", "no")
     assert (await petrobot("estop", "--clear")).code == 0
     call = asyncio.ensure_future(reached.call("reach"))
-    await petrobot.until(lambda: petrobot.arm.moving)
+    await until(lambda: petrobot.arm.moving)
     petrobot.arm.arrive()
     assert (await call).status == "success"
 
@@ -344,10 +344,10 @@ async def test_watch_follows_the_run_until_its_end(petrobot: Terminal) -> None:
     """It prints lines of text or JSON lines; its exit code is the run's."""
     path = petrobot.folder / "changes.jsonl"
     watching = asyncio.create_task(petrobot("watch", "--json", str(path)))
-    await petrobot.until(lambda: petrobot.operation.feed.watched)
+    await until(lambda: petrobot.operation.feed.watched)
     await petrobot.working()
     petrobot.arm.arrive()
-    await petrobot.until(lambda: petrobot.tokens("arm_free") == 1)
+    await until(lambda: petrobot.tokens("arm_free") == 1)
     assert path.read_text() == "", "the file is written in one piece, at the end"
     await petrobot("abort")
     assert (await watching).code == 1
@@ -451,9 +451,9 @@ async def test_the_result_says_that_the_host_was_too_busy(petrobot: Terminal) ->
     """The event loop did not run for longer than any set point is valid, so failures may be due to
     that."""
     await petrobot.working()
-    until = time.monotonic() + 0.2
-    while time.monotonic() < until:
+    busy = time.monotonic() + 0.2
+    while time.monotonic() < busy:
         pass
     assert (await petrobot("abort")).code == 0
-    await petrobot.until(lambda: bool(petrobot.mission.remarks))
+    await until(lambda: bool(petrobot.mission.remarks))
     assert "ms late" in petrobot.mission.result("realtime", 1.0)["host"]

@@ -9,6 +9,7 @@ from typing import Any
 from petrobot.coordinator.cli.watch import _snapshot
 from petrobot.services.comm.protocol.messages import Command
 from tests.cli.conftest import Terminal
+from tests.waiting import until
 
 
 def verbs(terminal: Terminal) -> list[str]:
@@ -32,7 +33,7 @@ async def test_pictures_and_states_come_while_an_operator_watches(petrobot: Term
     feed = petrobot.operation.feed
     changes: list[dict[str, Any]] = []
     stop = petrobot.operation.subscribe(changes.append)
-    await petrobot.until(
+    await until(
         lambda: bool(feed.state["images"] and feed.state["setpoints"] and feed.state["devices"])
     )
     stop()
@@ -55,10 +56,10 @@ async def test_without_an_operator_nothing_is_requested(petrobot: Terminal) -> N
     feed = petrobot.operation.feed
     polled: list[dict[str, Any]] = []
     petrobot.operation.watching._health = lambda node, up: polled.append({node: up})  # type: ignore[method-assign]
-    await petrobot.until(lambda: len(polled) > 3)
+    await until(lambda: len(polled) > 3)
     assert asked == [] and feed.state["images"] == {}
     stop = petrobot.operation.subscribe(lambda change: None)
-    await petrobot.until(lambda: {"status", "picture"} <= set(asked))
+    await until(lambda: {"status", "picture"} <= set(asked))
     stop()
 
 
@@ -68,11 +69,11 @@ async def test_old_set_points_are_not_shown(petrobot: Terminal) -> None:
     petrobot.arm.setpoint_age = 3.0
     stop = petrobot.operation.subscribe(lambda change: None)
     feed = petrobot.operation.feed
-    await petrobot.until(
+    await until(
         lambda: feed.state["devices"].get("arm", {}).get("values", {}).get("setpoint_age") == 3.0
     )
     asked = verbs(petrobot)
-    await petrobot.until(lambda: asked.count("picture") >= 2)
+    await until(lambda: asked.count("picture") >= 2)
     stop()
     assert feed.state["setpoints"] == {} and feed.state["images"] == {}
 

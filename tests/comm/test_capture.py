@@ -25,18 +25,10 @@ from petrobot.services.comm.streams.capture import (
 )
 from petrobot.services.comm.streams.image import Image, ImageSource
 from tests.ports import free_ports
-from tests.waiting import Limit
+from tests.waiting import Limit, wait_for
 
 SIZE = (48, 64)
 GREY = np.full((*SIZE, 3), 90, np.uint8)
-
-
-def until(awaited: str, holds: Callable[[], Any]) -> Any:
-    """Wait until this is true or an object, and return it."""
-    limit, pause = Limit(awaited), threading.Event()
-    while not (found := holds()) and limit.left():
-        pause.wait(0.01)
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +128,7 @@ def test_images_of_a_camera_are_stamped_on_arrival(device: type[Device]) -> None
     """Only the newest is kept, with the time of its arrival less the latency."""
     images = CaptureImages(2, lambda: 7.0, CaptureSettings(latency=0.03))
     images.start(30.0)
-    image = until("an image", images.newest)
+    image = wait_for(images.newest, awaited="an image")
     assert image.time == pytest.approx(6.97)
     assert image.pixels.shape == SIZE
     assert image.pixels[0, 0] == 59, "green by ITU-R BT.601"
@@ -151,15 +143,15 @@ def test_a_lost_camera_is_opened_again(
     """While it is away `condition` and `start` say so."""
     images = CaptureImages(0, time.monotonic, CaptureSettings(colour=True))
     images.start(30.0)
-    first: Image = until("an image", images.newest)
+    first: Image = wait_for(images.newest, awaited="an image")
     assert first.pixels.shape == (*SIZE, 3)
     device.absent = True
-    until("the loss", lambda: "cannot be opened" in images.condition)
+    wait_for(lambda: "cannot be opened" in images.condition, awaited="the loss")
     with pytest.raises(ConnectionError, match="camera 0 cannot be opened: is it plugged in"):
         images.start(30.0)
     device.absent = False
-    until("the return", lambda: not images.condition)
-    later: Image = until("an image after the return", images.newest)
+    wait_for(lambda: not images.condition, awaited="the return")
+    later: Image = wait_for(images.newest, awaited="an image after the return")
     assert later.time > first.time
     images.close()
     assert "camera 0 was lost; it is opened again in" in caplog.text
@@ -172,10 +164,10 @@ def test_an_image_that_cannot_be_converted_is_no_end(device: type[Device]) -> No
     images = CaptureImages(0, time.monotonic)
     with pytest.raises(ConnectionError, match="camera 0: no usable image, try another fourcc"):
         images.start(30.0)
-    until("the second attempt", lambda: device.opened.count("released") == 2)
+    wait_for(lambda: device.opened.count("released") == 2, awaited="the second attempt")
     assert "no usable image" in images.condition, "said until an image came"
     device.channels = 3
-    until("an image", images.newest)
+    wait_for(images.newest, awaited="an image")
     images.close()
 
 
@@ -183,12 +175,12 @@ def test_images_that_nobody_wants_are_taken_and_dropped(device: type[Device]) ->
     """So the first image after a start is not an old one from the camera's buffer."""
     images = CaptureImages(0, time.monotonic)
     images.start(30.0)
-    until("an image", images.newest)
+    wait_for(images.newest, awaited="an image")
     images.stop()
     assert images.newest() is None
     began = time.monotonic()
     images.start(30.0)
-    assert until("an image", images.newest).time >= began
+    assert wait_for(images.newest, awaited="an image").time >= began
     images.close()
 
 
@@ -287,15 +279,15 @@ def test_a_network_camera_is_cut_off_and_comes_back(network: Network) -> None:
     url = f"http://127.0.0.1:{network.port}/video"
     images = open_images({"source": f"capture:{url}"}, time.monotonic)
     images.start(25.0)
-    image = until("an image", images.newest)
+    image = wait_for(images.newest, awaited="an image")
     assert image.pixels.shape == SIZE and abs(float(image.pixels.mean()) - 90) < 3
     network.unplug()
-    until("the loss", lambda: images.condition)
+    wait_for(lambda: images.condition, awaited="the loss")
     assert url in images.condition
     network.plug()
-    until("the return", lambda: not images.condition)
+    wait_for(lambda: not images.condition, awaited="the return")
     images.start(25.0)
-    assert until("an image again", images.newest).pixels.shape == SIZE
+    assert wait_for(images.newest, awaited="an image again").pixels.shape == SIZE
     images.close()
 
 
@@ -317,11 +309,11 @@ def test_no_part_of_a_cut_image_is_delivered_and_another_size_may_come_back() ->
     try:
         images.start(0.0)
         images.start(25.0)
-        until("the first image", lambda: more((240, 320)))
+        wait_for(lambda: more((240, 320)), awaited="the first image")
         camera.unplug()
-        until("the loss", lambda: more((0, 0)) or "was lost" in images.condition)
+        wait_for(lambda: more((0, 0)) or "was lost" in images.condition, awaited="the loss")
         camera.plug(bright[:120])
-        until("smaller images", lambda: more((120, 320)))
+        wait_for(lambda: more((120, 320)), awaited="smaller images")
         assert images.condition == ""
         assert {each.shape for each in taken} == {(240, 320), (120, 320)}
         assert all(each[-20:].mean() > 195 for each in taken)

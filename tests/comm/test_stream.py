@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import msgpack
@@ -23,6 +23,7 @@ from petrobot.services.comm.streams.stream import (
     StreamSender,
 )
 from tests.comm.ends import frame, framed
+from tests.waiting import wait_for
 
 
 class RecordingSink:
@@ -134,26 +135,18 @@ def sender(receiver: StreamReceiver, key: bytes | None) -> Iterator[StreamSender
     one.close()
 
 
-def _until(condition: Callable[[], bool], *steps: Callable[[], object]) -> None:
-    end = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < end, "it did not come to pass"
-        for step in steps:
-            step()
-
-
 def test_a_stream_from_its_first_value_to_its_end(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     assert not sender.send((0.0,)), "not connected yet: dropped, a newer one follows"
-    _until(lambda: sender.up, sender.advance, receiver.poll)
+    wait_for(lambda: sender.up, sender.advance, receiver.poll)
     assert sender.send((1.0, 2.0), held=0.08) and sender.send((3.0, 4.0))
-    _until(lambda: bool(sink.got), receiver.poll)
-    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (3.0, 4.0), receiver.poll)
+    wait_for(lambda: bool(sink.got), receiver.poll)
+    wait_for(lambda: sink.got[-1] is not None and sink.got[-1][0] == (3.0, 4.0), receiver.poll)
     assert sender.send((5.0,), run="another")
-    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (5.0,), receiver.poll)
+    wait_for(lambda: sink.got[-1] is not None and sink.got[-1][0] == (5.0,), receiver.poll)
     sender.close()
-    _until(lambda: sink.got[-1] is None, receiver.poll)
+    wait_for(lambda: sink.got[-1] is None, receiver.poll)
     assert len(receiver.sockets()) == 1 and receiver.faults == 0
 
 
@@ -162,7 +155,7 @@ def test_after_an_emergency_stop_a_new_connection_does_not_make_a_run_new(
     began: str, counts: bool, sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     """Nor does a run that published nothing before, such as that of a frozen process."""
-    _until(lambda: bool(sink.got), lambda: sender.send((1.0,), run="old"), receiver.poll)
+    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,), run="old"), receiver.poll)
     start = time.monotonic()
     receiver.bar()
     if began == "after":
@@ -173,41 +166,41 @@ def test_after_an_emergency_stop_a_new_connection_does_not_make_a_run_new(
         sender.send((2.0,), run="new", age=time.monotonic() - start)
 
     end = time.monotonic() + 1.0
-    _until(lambda: time.monotonic() > end or sink.got[-1] is not None, send, receiver.poll)
+    wait_for(lambda: time.monotonic() > end or sink.got[-1] is not None, send, receiver.poll)
     assert sender.up and (sink.got[-1] is not None) is counts
 
 
 def test_values_of_a_sender_that_is_gone_are_withdrawn(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
-    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     assert sender._line is not None
     sender._line.sock.close()
-    _until(lambda: sink.got[-1] is None, receiver.poll)
+    wait_for(lambda: sink.got[-1] is None, receiver.poll)
 
 
 def test_a_sender_connects_again_to_a_receiver_that_returns(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
-    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     host, port = receiver.address
     receiver.close()
-    _until(lambda: not sender.up, lambda: sender.send((2.0,)))
+    wait_for(lambda: not sender.up, lambda: sender.send((2.0,)))
     again = StreamReceiver(
         "motion", {"catch_point": Incoming(0.04, sink, "t1")}, host=host, port=port, key=key
     )
-    _until(lambda: sink.got[-1] is not None, lambda: sender.send((3.0,)), again.poll)
+    wait_for(lambda: sink.got[-1] is not None, lambda: sender.send((3.0,)), again.poll)
     again.close()
 
 
 def test_the_newest_sender_of_a_stream_takes_it_over(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
-    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     other = StreamSender(
         "vision2", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key
     )
-    _until(
+    wait_for(
         lambda: sink.got[-1] is not None and sink.got[-1][0] == (2.0,),
         lambda: other.send((2.0,)),
         receiver.poll,
@@ -237,7 +230,7 @@ def test_a_stream_with_wrong_data_is_refused_with_the_reason(
     sender = StreamSender(
         "vision", stream, period, *receiver.address, receiver="motion", ticket=ticket, key=key
     )
-    _until(lambda: bool(sender.refusal), lambda: sender.send((1.0,)), receiver.poll)
+    wait_for(lambda: bool(sender.refusal), lambda: sender.send((1.0,)), receiver.poll)
     assert sender.refusal.startswith(code) and not sender.up
     assert receiver.faults >= 1 and sink.got == []
     sender.close()
@@ -255,7 +248,7 @@ def test_a_sender_without_the_key_is_refused(sink: RecordingSink, receiver: Stre
             ticket="t1",
             key=wrong,
         )
-        _until(
+        wait_for(
             lambda one=sender: bool(one.refusal),  # type: ignore[misc]
             partial(sender.send, (1.0,)),
             receiver.poll,
@@ -284,9 +277,9 @@ def test_malformed_set_points_end_only_their_own_connection(
     with socket.create_connection(receiver.address) as sock:
         for data in said:
             sock.sendall(data)
-            _until(lambda: receiver.faults > 0 or _is_served(receiver), receiver.poll)
-        _until(lambda: receiver.faults == 1 and len(receiver.sockets()) == 1, receiver.poll)
-    _until(
+            wait_for(lambda: receiver.faults > 0 or _is_served(receiver), receiver.poll)
+        wait_for(lambda: receiver.faults == 1 and len(receiver.sockets()) == 1, receiver.poll)
+    wait_for(
         lambda: bool(sink.got) and sink.got[-1] is not None,
         lambda: sender.send((1.0,)),
         receiver.poll,
@@ -302,7 +295,7 @@ def test_many_idle_connections_do_not_block_a_sender(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     idle = [socket.create_connection(receiver.address) for _ in range(40)]
-    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     assert len(receiver.sockets()) <= 17
     for one in idle:
         one.close()
@@ -312,11 +305,11 @@ def test_many_idle_connections_do_not_block_a_sender(
 def test_a_frozen_receiver_never_blocks_its_sender_and_then_gets_the_newest_value(
     sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
-    _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
+    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     for n in range(20_000):
         sender.send((float(n),))
     assert sender.dropped > 0
-    _until(
+    wait_for(
         lambda: sink.got[-1] is not None and sink.got[-1][0] == (-1.0,),
         receiver.poll,
         lambda: sender.send((-1.0,)),

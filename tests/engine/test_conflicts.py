@@ -26,8 +26,6 @@ from petrobot.coordinator.engine import (
     RunEnded,
     StopConfirmed,
     Subject,
-    state_from_plain,
-    to_plain,
 )
 from petrobot.coordinator.engine.step import RECORDED
 from petrobot.coordinator.task import Executed, Status
@@ -292,12 +290,6 @@ def test_old_journals_keep_the_order_in_the_file(play: Plays) -> None:
     p = play("go=1 arm~=1 a!=1 b!=1 c! done_a done_b", ARM, policy=RECORDED[3])
     p(ended("b#1"), ended("a#1"), ended("c#1"))
     assert p.fired == ["hold", "free", "first", "second"] and not p.state.waits
-
-
-def test_a_state_with_waits_is_written_and_read(play: Plays) -> None:
-    p = play("go=1 arm~=1 a!=1 b!=1 c! done_a done_b", ARM)
-    p(ended("b#1"))
-    assert state_from_plain(to_plain(p.state)) == p.state
 
 
 def test_exclusive_conditions_are_no_conflict(play: Plays) -> None:

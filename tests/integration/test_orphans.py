@@ -6,9 +6,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from tests.integration.test_resume_processes import nodes
 from tests.ports import free_ports
 from tests.processes import alive, below, children, kill
-from tests.waiting import beat
+from tests.waiting import beat, until, wait_for
 
 pytestmark = pytest.mark.processes
 PATIENCE = 60.0
@@ -62,14 +60,6 @@ args = {{ mark = "{folder}/alone" }}
 ACTIONS = ("with_servo", "with_hand", "alone")
 
 
-def until(holds: Callable[[], bool], what: str) -> None:
-    """Wait for a condition."""
-    deadline, pause = time.monotonic() + PATIENCE, threading.Event()
-    while not holds():
-        assert time.monotonic() < deadline, what
-        pause.wait(0.01)
-
-
 async def call(folder: Path, names: tuple[str, ...]) -> None:
     """Call these actions and services of the node, and wait until each reports that it hangs."""
     directory = load(folder / "services.toml")
@@ -88,7 +78,7 @@ async def call(folder: Path, names: tuple[str, ...]) -> None:
         )
         caller.call(client.now(), Call(f"tester/{name}", name, arguments, PATIENCE))
         client.flush()
-        await asyncio.to_thread(until, (folder / name).exists, f"{name} was not called")
+        await until((folder / name).exists, f"the call of {name}")
     await client.close()
     await beat()
 
@@ -106,7 +96,7 @@ def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
         [node] = children(launcher.pid)
         asyncio.run(call(folder, ACTIONS))
         (folder / "servo").touch()
-        until((folder / "servo.hung").exists, "the servo does not hang")
+        wait_for((folder / "servo.hung").exists, awaited="the hanging servo")
         yield launcher.pid, node
     finally:
         kill({launcher.pid, *family, *below(launcher.pid)})
@@ -122,7 +112,7 @@ def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
         family = below(node)
         assert len(family) >= 2 * 4, "each of them has its keeper"
         os.kill(node, signal.SIGKILL)
-        until(lambda: not any(map(alive, family)), f"left behind: {family}")
+        wait_for(lambda: not any(map(alive, family)), awaited=f"the end of {family}")
 
 
 def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
@@ -133,7 +123,7 @@ def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
         family = below(launcher)
         assert node in family and len(family) >= 1 + 2 * 4, "each worker has its keeper"
         os.kill(launcher, signal.SIGKILL)
-        until(lambda: not any(map(alive, family)), f"left behind: {family}")
+        wait_for(lambda: not any(map(alive, family)), awaited=f"the end of {family}")
 
 
 def test_a_lock_step_node_ends_with_its_launcher(tmp_path: Path) -> None:
@@ -145,4 +135,4 @@ def test_a_lock_step_node_ends_with_its_launcher(tmp_path: Path) -> None:
     assert len(family) == 1
     os.kill(launcher.pid, signal.SIGKILL)
     launcher.wait(PATIENCE)
-    until(lambda: not any(map(alive, family)), f"left behind: {family}")
+    wait_for(lambda: not any(map(alive, family)), awaited=f"the end of {family}")

@@ -214,7 +214,7 @@ def test_left_is_left_and_far_is_up() -> None:
 
 
 def test_scan_rows_are_about_as_far_apart_as_asked_and_reach_as_far() -> None:
-    grid = ScanGrid.of(VIEW, 1.2, spacing=0.03)
+    grid = ScanGrid.of(VIEW, 1.2)
     steps = np.diff(grid.x)
     assert grid.x[0] < 0.44 and 1.1 < grid.x[-1] <= 1.2
     assert steps.min() > 0.015 and steps.max() < 0.05

@@ -3,10 +3,13 @@ its own clock."""
 
 from __future__ import annotations
 
+import importlib
 import math
+import threading
+import time
 import tomllib
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -15,6 +18,7 @@ import pytest
 
 from petrobot.services.action import Cancelled, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
 from petrobot.sim.catching.drives import ArmBus, ratings
@@ -23,6 +27,57 @@ from tests.bare_ports import BarePorts
 TABLE = tomllib.loads(
     files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
 )
+
+
+class LiveHub:
+    """A hub, polled by a thread until it is closed. Simulated drives on it live in wall-clock
+    time."""
+
+    def __init__(self, hub: CanHub, step: Callable[[float], None] = lambda now: None) -> None:
+        self.channel = hub.channel
+        self._hub, self._step = hub, step
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._live)
+        self._thread.start()
+
+    def _live(self) -> None:
+        start = time.monotonic()
+        while not self._over.is_set():
+            self._hub.poll(0.001)
+            self._step(time.monotonic() - start)
+        self._hub.close()
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+def live_drives(bus: Any, step: Callable[[float], None]) -> LiveHub:
+    """Put simulated drives on a hub of their own."""
+    hub = CanHub()
+    port = hub.port()
+
+    def live(now: float) -> None:
+        for frame in port.receive():
+            bus.receive(now, frame)
+        step(now)
+        for frame in bus.drain():
+            port.send(frame)
+
+    return LiveHub(hub, live)
+
+
+def canopen_network(live: LiveHub) -> Iterator[Any]:
+    """Yield the network of an independent CANopen master on a hub, and end both."""
+    network = importlib.import_module("canopen").Network()
+    network.connect(interface="petrobot_stream", channel=live.channel)
+    yield network
+    for node in network.values():
+        if node.id < 3:  # a drive
+            node.rpdo[1].stop()
+    network.sync.stop()
+    network.disconnect()
+    live.close()
 
 
 class SimplePlant:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,35 +27,16 @@ from petrobot.services.comm.canopen.byte_stream import (
     parse_channel,
 )
 from petrobot.services.comm.canopen.ports import PythonCanBus, StreamPort, open_can
+from tests.motion.conftest import LiveHub
 from tests.waiting import Limit
 
 PATIENCE = 5.0
 
 
-class RunningHub:
-    """A hub polled by a thread until it is closed."""
-
-    def __init__(self, channel: str) -> None:
-        self.hub = CanHub(channel)
-        self.channel = self.hub.channel
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        while not self._over.is_set():
-            self.hub.poll(0.01)
-        self.hub.close()
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-
-
 @pytest.fixture(params=["tcp", "unix"])
 def channel(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    running = RunningHub(
-        "tcp://127.0.0.1:0" if request.param == "tcp" else f"unix://{tmp_path}/can"
+    running = LiveHub(
+        CanHub("tcp://127.0.0.1:0" if request.param == "tcp" else f"unix://{tmp_path}/can")
     )
     yield running.channel
     running.close()
@@ -207,7 +187,7 @@ def test_without_a_hub_there_is_one_clear_error(tmp_path: Path) -> None:
 
 
 def test_a_closed_hub_is_noticed() -> None:
-    running = RunningHub("tcp://127.0.0.1:0")
+    running = LiveHub(CanHub())
     bus, port = _open(running.channel), StreamPort(running.channel)
     bus.send(can.Message(arbitration_id=1, is_extended_id=False))
     limit = Limit("the frame")

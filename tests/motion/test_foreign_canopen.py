@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import importlib
 import threading
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.resources import files
@@ -15,7 +14,6 @@ import can
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.canopen.cia402 import (
     DriveCommand,
     DriveFault,
@@ -27,6 +25,8 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.sim.catching.drives import ArmBus, ratings
+from tests.motion.conftest import canopen_network, live_drives
+from tests.waiting import wait_for
 
 canopen: Any = importlib.import_module("canopen")  # It has hardly any annotations.
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
@@ -35,68 +35,29 @@ INPUTS_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("digital_i
 PATIENCE = 10.0
 
 
-class LiveDrives:
-    """Our drives on a hub, run by a thread in wall-clock time."""
-
-    def __init__(self, plant: Any, table: Any) -> None:
-        self.hub = CanHub()
-        self.channel = self.hub.channel
-        self.drives = ArmBus(plant, ratings(table))
-        self._port = self.hub.port()
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._live)
-        self._thread.start()
-
-    def _live(self) -> None:
-        start, done = time.monotonic(), 0.0
-        while not self._over.is_set():
-            self.hub.poll(0.001)
-            now = time.monotonic() - start
-            for frame in self._port.receive():
-                self.drives.receive(now, frame)
-            while done < now:
-                self.drives.step(done, 0.001)
-                done += 0.001
-            for frame in self.drives.drain():
-                self._port.send(frame)
-        self.hub.close()
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
+@pytest.fixture
+def drives(make_plant: Callable[[], Any], table: Any) -> ArmBus:
+    return ArmBus(make_plant(), ratings(table))
 
 
 @pytest.fixture
-def live(make_plant: Callable[[], Any], table: Any) -> Iterator[LiveDrives]:
-    drives = LiveDrives(make_plant(), table)
-    yield drives
-    drives.close()
+def network(drives: ArmBus) -> Iterator[Any]:
+    done = 0.0
 
+    def step(now: float) -> None:
+        nonlocal done
+        while done < now:
+            drives.step(done, 0.001)
+            done += 0.001
 
-@pytest.fixture
-def network(live: LiveDrives) -> Iterator[Any]:
-    network = canopen.Network()
-    network.connect(interface="petrobot_stream", channel=live.channel)
-    yield network
-    for node in network.values():
-        node.rpdo[1].stop()
-    network.sync.stop()
-    network.disconnect()
+    yield from canopen_network(live_drives(drives, step))
 
 
 def _changed(pdo: Any, before: float) -> bool:
     return bool(pdo.timestamp != before)
 
 
-def _until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    pause = threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline, what
-        pause.wait(0.005)
-
-
-def test_the_canopen_package_controls_our_drive(live: LiveDrives, network: Any) -> None:
+def test_the_canopen_package_controls_our_drive(drives: ArmBus, network: Any) -> None:
     node = BaseNode402(1, EDS)
     network.add_node(node)
     node.sdo.RESPONSE_TIMEOUT = 2.0
@@ -118,7 +79,7 @@ def test_the_canopen_package_controls_our_drive(live: LiveDrives, network: Any) 
     node.sdo[0x6060].raw = 8
     network.sync.start(0.01)
     node.nmt.state = "OPERATIONAL"
-    _until(lambda: bool(node.tpdo[1].timestamp), "no TPDO came")
+    wait_for(lambda: bool(node.tpdo[1].timestamp), awaited="a TPDO")
     target = node.sdo[0x6064].raw
     node.rpdo[1][0x607A].raw = target
     node.rpdo[1].start(0.01)
@@ -130,16 +91,14 @@ def test_the_canopen_package_controls_our_drive(live: LiveDrives, network: Any) 
         node.rpdo[1][0x607A].raw = target
         node.rpdo[1].update()
         seen = node.tpdo[1].timestamp
-        _until(partial(_changed, node.tpdo[1], seen), f"no TPDO in step {step}")
-    _until(
-        lambda: bool(abs(node.tpdo[1][0x6064].raw - target) < 2000), "the set point was not reached"
-    )
-    assert live.drives.plant.q[0] == pytest.approx(from_units(target), abs=2e-3)
+        wait_for(partial(_changed, node.tpdo[1], seen), awaited=f"a TPDO in step {step}")
+    wait_for(lambda: bool(abs(node.tpdo[1][0x6064].raw - target) < 2000), awaited="the set point")
+    assert drives.plant.q[0] == pytest.approx(from_units(target), abs=2e-3)
     with pytest.raises(canopen.SdoAbortedError) as refused:
         node.sdo[0x6060].raw = 1
     assert refused.value.code in (0x06090030, 0x08000022)
-    live.drives.trip(0, DriveFault.OVERHEATED)
-    _until(lambda: bool(node.emcy.log), "no EMCY came")
+    drives.trip(0, DriveFault.OVERHEATED)
+    wait_for(lambda: bool(node.emcy.log), awaited="an EMCY")
     assert node.emcy.log[0].code == DriveFault.OVERHEATED
 
 

@@ -18,8 +18,6 @@ from petrobot.services.conformance import DriverCheck, check_driver
 from petrobot.services.device import Driver, Ports, key
 from tests.waiting import Limit
 
-NO_PORTS = cast(Ports, None)
-
 
 class Axis(Driver):
     """Moves at 0.1 m/s; keeps all rules."""

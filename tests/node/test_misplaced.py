@@ -3,18 +3,16 @@ remedy, and exit code 2."""
 
 from __future__ import annotations
 
-import io
 import sys
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.cli import main
 from petrobot.services.comm.location_file import DirectoryError, load, parse
 from petrobot.services.comm.location_file import code as location_code
 from petrobot.services.comm.location_file.host_checks import misplaced, signatures
 from petrobot.services.comm.protocol.security import is_loopback
+from tests.cli.test_mistakes import said as told
 
 SHIPPED = Path(__file__).parents[2] / "services.toml"
 VISION = 'host = "127.0.0.1"\nport = 7301'
@@ -156,14 +154,6 @@ MISTAKES: list[tuple[str, str, str]] = [
     ("[nodes.vision]", "[node.vision]", ":21: node: unknown table; did you mean 'nodes'?"),
     ("[nodes.vision]", "[nodes.vision", ":21: not valid TOML"),
 ]
-
-
-def told(*command: str) -> tuple[int, str]:
-    """Run a command; return its exit code and all its output."""
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said):
-        code = main(list(command))
-    return code, said.getvalue()
 
 
 EMPTY = 'schema = 1\n[task]\nname = "empty"\nfinal = "true"\n'

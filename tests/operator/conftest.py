@@ -17,7 +17,7 @@ from petrobot.services.node.node import GENERAL, Node
 from petrobot.services.scripted import load
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
-from tests.waiting import beat
+from tests.waiting import until
 
 SERVICES = """\
 schema = 1
@@ -146,15 +146,9 @@ class Cell:
         """Give a command as the operator."""
         return await self.station.command("ana", verb, data)
 
-    async def until(self, holds: Callable[[], bool], timeout: float = 60.0) -> None:
-        """Wait until the condition holds."""
-        async with asyncio.timeout(timeout):
-            while not holds():
-                await beat(0.002)
-
     async def ended(self) -> Mapping[str, Any]:
         """Wait for the end of the run; return its result."""
-        await self.until(lambda: self.state["result"] is not None)
+        await until(lambda: self.state["result"] is not None)
         return self.state["result"]  # type: ignore[no-any-return]
 
 

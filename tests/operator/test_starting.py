@@ -28,7 +28,7 @@ from petrobot.coordinator.run.journal import read_journal
 from petrobot.coordinator.task.file import loads
 from petrobot.services.comm.location_file import parse
 from tests.operator.conftest import SCRIPT, SERVICES, TASK, Cell
-from tests.waiting import beat
+from tests.waiting import beat, until
 
 pytestmark = pytest.mark.processes
 
@@ -63,7 +63,7 @@ class Simulated(Cell):
         )
         assert answer["ok"], answer
         result = await self.ended()
-        await self.until(lambda: self.station._going is None)
+        await until(lambda: self.station._going is None)
         return answer["run"], result
 
 
@@ -269,11 +269,11 @@ async def test_a_run_in_lock_step_can_be_controlled(cell: Simulated) -> None:
     assert (await cell.say("breakpoint", element="transitions.seen", on=True))["ok"]
     answer = await cell.say("start", mode="lockstep", pace=0, runs=4)
     assert answer["ok"], answer
-    await cell.until(lambda: cell.state["paused"] is not None)
+    await until(lambda: cell.state["paused"] is not None)
     run = cell.station._run
     assert run is not None and run.operation is not None
     shell = run.operation.shell
-    await cell.until(lambda: cell.state["time"] == shell.now())
+    await until(lambda: cell.state["time"] == shell.now())
     time, fired = cell.state["time"], cell.state["mission"]["firings"]
     for _ in range(20):
         await beat(0.002)
@@ -282,7 +282,7 @@ async def test_a_run_in_lock_step_can_be_controlled(cell: Simulated) -> None:
     assert cell.state["marking"]["jobs"] == 4
     assert (await cell.say("override_selector", primitive_task="look", action="look_twice"))["ok"]
     assert (await cell.say("step"))["ok"]
-    await cell.until(
+    await until(
         lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
     )
     assert (await cell.say("breakpoint", element="transitions.seen", on=False))["ok"]
@@ -308,11 +308,11 @@ async def test_an_emergency_stop_in_a_simulated_run_also_stops_the_real_devices(
 
     monkeypatch.setattr(station, "order_all", order_all)
     await cell.say("start", task="moving", mode="lockstep", pace=0.01, runs=9)
-    await cell.until(lambda: cell.state["mission"]["state"] == "running")
+    await until(lambda: cell.state["mission"]["state"] == "running")
     assert (await cell.station.command("ben", "estop", {}))["ok"]
     assert cell.state["mission"]["state"] == "stopped"
     assert (await cell.ended())["status"] == "error"
-    await cell.until(lambda: cell.station._going is None)
+    await until(lambda: cell.station._going is None)
     assert cell.state["mission"] == {
         **cell.state["mission"],
         "state": "stopped",

@@ -19,6 +19,7 @@ from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from tests.operator.conftest import TASK, Cell
+from tests.waiting import until
 
 pytestmark = pytest.mark.processes
 
@@ -47,12 +48,12 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
     """Pause, step and tokens work; the command line finds the run until it has ended."""
     cell.station.address = lambda run: RunAddress(run, "http://127.0.0.1:1", "secret", os.getpid())
     started = await cell.say("start", task="moving")
-    await cell.until(lambda: cell.state["mission"]["state"] == "running")
+    await until(lambda: cell.state["mission"]["state"] == "running")
     assert find_address(None, cell.runs).run == started["run"]
     assert (await cell.say("pause"))["ok"]
     fired = cell.state["mission"]["firings"]
     assert (await cell.say("step"))["ok"]
-    await cell.until(
+    await until(
         lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
     )
     assert (await cell.say("add_tokens", place="jobs"))["ok"]
@@ -68,10 +69,10 @@ async def test_the_run_can_be_controlled_while_it_is_active(cell: Cell) -> None:
 async def test_times_on_the_page_are_those_of_the_journal(cell: Cell) -> None:
     """Of each firing; and a snapshot has the time now, although nothing has happened since."""
     started = await cell.say("start", task="moving")
-    await cell.until(lambda: cell.state["mission"]["state"] == "running")
+    await until(lambda: cell.state["mission"]["state"] == "running")
     await cell.say("pause")
     before = cell.state["time"]
-    await cell.until(lambda: cell.station.snapshot()["time"] > before + 0.2)
+    await until(lambda: cell.station.snapshot()["time"] > before + 0.2)
     await cell.say("resume")
     await cell.ended()
     shown = [(f["transition"], f["at"]) for f in cell.state["firings"]]
@@ -83,7 +84,7 @@ async def test_a_resumed_run_is_shown_as_it_was(cell: Cell, tmp_path: Path) -> N
     """Its coordinator was killed in a pause. What the journal tells is shown as before: firings,
     when each run started and since when it is held, why the net is paused."""
     run = (await cell.say("start", task="moving", runs=9))["run"]
-    await cell.until(lambda: len(cell.state["ended"]) > 2)
+    await until(lambda: len(cell.state["ended"]) > 2)
     assert (await cell.say("override_selector", primitive_task="pick", action="pick_part"))["ok"]
     assert (await cell.say("pause"))["ok"]
     before = cell.station.snapshot()
@@ -177,7 +178,7 @@ async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:
     ] == "refused"
     assert (await cell.say("override_selector", primitive_task="look", action="look_twice"))["ok"]
     started = await cell.say("start")
-    await cell.until(lambda: cell.state["paused"] is not None)
+    await until(lambda: cell.state["paused"] is not None)
     assert [f["transition"] for f in cell.state["firings"]] == ["begin"]
     assert cell.state["selectors"]["look"]["override"] == "look_twice"
     assert (await cell.say("breakpoint", element="transitions.seen", on=False))["ok"]
@@ -192,7 +193,7 @@ async def test_closing_ends_the_active_run(cell: Cell) -> None:
     """The station aborts it, and its journal and result are complete."""
     cell.tasks.save_text("long", None, TASK.replace("tokens = 2", "tokens = 9"))
     started = await cell.say("start", task="long")
-    await cell.until(lambda: bool(cell.state["runs"]))
+    await until(lambda: bool(cell.state["runs"]))
     await cell.station.close()
     result = json.loads((cell.runs / started["run"] / RESULT).read_text())
     assert result["status"] == "error" and cell.state["mission"]["state"] == "aborted"

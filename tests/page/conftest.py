@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import shutil
 import socket
@@ -19,7 +18,6 @@ from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.task import Executed, Status
 from petrobot.coordinator.task.file import load
 from tests.page.stage import Part, Stage
-from tests.waiting import beat
 
 if TYPE_CHECKING:
     from playwright.async_api import Browser, ConsoleMessage, Locator
@@ -146,13 +144,6 @@ def is_fault(message: ConsoleMessage) -> bool:
     """Return whether the message is an error. The answer 422 for a net that cannot be analysed yet,
     which the browser logs, is not."""
     return message.type == "error" and "422" not in message.text
-
-
-async def until(holds: Callable[[], bool]) -> None:
-    """Wait until the condition holds in this process."""
-    async with asyncio.timeout(PATIENCE_MS / 1000):
-        while not holds():
-            await beat()
 
 
 NOTE_TOASTS = """() => {

@@ -198,23 +198,6 @@ async def test_a_compressed_body_is_limited_by_its_expanded_size(page: Page) -> 
     ).status in (400, 413)
 
 
-NO_TEXT = [b"\x00\x01", b"{}", b"\xff" * 1_000, b""]
-
-
-@pytest.mark.parametrize("frame", NO_TEXT)
-async def test_a_binary_frame_ends_only_its_own_connection(page: Page, frame: bytes) -> None:
-    """The protocol is text. The connection of a client that sends bytes is closed with a reason."""
-    async with joined(page) as good, joined(page, "bad", "2") as bad:
-        await good.until(lambda s: True)
-        await bad.until(lambda s: True)
-        await bad.socket.send_bytes(frame)
-        async with asyncio.timeout(60):
-            while not bad.socket.closed:
-                await bad.socket.receive()
-        assert bad.socket.close_code == aiohttp.WSCloseCode.POLICY_VIOLATION
-        assert (await good.command("take_controls"))["ok"]
-
-
 @pytest.mark.parametrize(
     "verb",
     [

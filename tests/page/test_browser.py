@@ -26,7 +26,6 @@ from tests.page.conftest import (
     nobody_listens,
     served,
     toasted,
-    until,
 )
 from tests.page.stage import Part, Stage
 from tests.page.test_changes import changes
@@ -50,6 +49,7 @@ from tests.page.steps import (
     start_mission,
     take_controls,
 )
+from tests.waiting import until
 
 
 async def test_a_new_user_draws_runs_and_understands(

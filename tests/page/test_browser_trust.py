@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.page.server import Page, start_page
-from tests.page.conftest import browser_missing, nobody_listens, served, until
+from tests.page.conftest import browser_missing, nobody_listens, served
 from tests.page.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -23,6 +23,7 @@ from playwright.async_api import Browser, WebSocketRoute, expect
 from playwright.async_api import Page as Tab
 
 from tests.page.steps import SIZE, Watch, element, opened, start_mission
+from tests.waiting import until
 
 Mangle = Callable[[str], str | bytes]
 

@@ -26,7 +26,6 @@ from tests.page.conftest import (
     is_fault,
     note_toasts,
     toasted,
-    until,
 )
 from tests.page.stage import Stage
 
@@ -37,6 +36,7 @@ from playwright.async_api import Browser, Locator, Route, WebSocketRoute, expect
 from playwright.async_api import Page as Tab
 
 from tests.page.steps import element, settled
+from tests.waiting import until
 
 DRAWING = "Drawing of the task"
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"

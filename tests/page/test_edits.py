@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.page.edits import EditError, Rename, edited, parse, plain
+from tests.page.test_formatting import sent_back
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 FILES = [*sorted(SHIPPED.glob("*.toml")), *sorted((Path(__file__).parent / "tasks").glob("*.toml"))]
@@ -35,15 +36,7 @@ comments = st.sampled_from(["", "  # why it is so", ' # 1 [not.a.header] = "text
 
 def through_a_browser(document: dict[str, Any]) -> dict[str, Any]:
     """Return what the page sends back: JSON, in which 1.0 has become 1."""
-
-    def shorten(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {k: shorten(v) for k, v in value.items()}
-        if isinstance(value, list):
-            return [shorten(v) for v in value]
-        return int(value) if isinstance(value, float) and value.is_integer() else value
-
-    sent: dict[str, Any] = shorten(json.loads(json.dumps(document)))
+    sent: dict[str, Any] = sent_back(json.loads(json.dumps(document)))
     return sent
 
 

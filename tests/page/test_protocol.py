@@ -231,14 +231,17 @@ NONSENSE = (
 )
 
 
-@pytest.mark.parametrize("text", NONSENSE)
-async def test_an_invalid_message_ends_the_connection_with_a_reason(page: Page, text: str) -> None:
-    """A client that violates the protocol gets a reason and is disconnected; other clients are not
-    affected."""
+@pytest.mark.parametrize("sent", [*NONSENSE, b"\x00\x01", b"{}", b"\xff" * 1_000, b""])
+async def test_an_invalid_message_ends_the_connection_with_a_reason(
+    page: Page, sent: str | bytes
+) -> None:
+    """A client that violates the protocol, which is text, gets a reason and is disconnected; other
+    clients are not affected."""
     async with joined(page) as good, joined(page, "bad", "2") as bad:
         await good.until(lambda s: True)
         await bad.until(lambda s: True)
-        await bad.socket.send_str(text)
+        send = bad.socket.send_bytes if isinstance(sent, bytes) else bad.socket.send_str
+        await send(sent)  # type: ignore[arg-type]
         async with asyncio.timeout(60):
             while not bad.socket.closed:
                 await bad.socket.receive()

@@ -25,6 +25,7 @@ from playwright.async_api import Browser, Locator, expect
 from playwright.async_api import Page as Tab
 
 from tests.page.steps import Watch, element, opened
+from tests.waiting import until
 
 expect.set_options(timeout=PATIENCE_MS)
 
@@ -186,7 +187,7 @@ async def test_the_selector_is_overridden_and_frozen_from_the_page(
     await expect(selected).to_be_visible()
     reasons = {run["why"] for run in cell.state["ended"] if run["place"] == "look"}
     assert "chosen by the operator" in reasons
-    await cell.until(lambda: cell.state["result"] is not None)  # It arrives after the status.
+    await until(lambda: cell.state["result"] is not None)  # It arrives after the status.
     assert cell.state["result"]["learned"]["runs_counted"] == 0
 
 
@@ -275,7 +276,7 @@ async def test_the_holder_of_the_controls_clears_the_emergency_stop(
     await expect(ben.get_by_role("button", name="Clear the stop")).to_have_attribute(
         "title", re.compile("holds the controls. Ask for them under Live.")
     )
-    await cell.until(lambda: cell.station._going is None)
+    await until(lambda: cell.station._going is None)
     await expect(mission(ana)).to_contain_text("Emergency stop")
     clear = ana.get_by_role("button", name="Clear the stop")
     await clear.focus()

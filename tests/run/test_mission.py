@@ -174,7 +174,7 @@ def test_every_error_branch_returns_to_the_normal_flow(
     assert mission.executor.finished is not None
     assert mission.executor.finished.status is Status.SUCCESS
     assert [c.status for c in mission.tally.cycles] == [Status.ERROR, *[Status.SUCCESS] * 3]
-    assert mission.tally.cycles[0].cause == cause
+    assert mission.tally.cycles[0].worst[1] == cause
     assert [bar.cause for bar in timeline.bars.values() if bar.status is Status.ERROR] == [cause]
 
 

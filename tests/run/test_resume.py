@@ -154,7 +154,7 @@ def outcome(mission: Mission) -> Mapping[str, Any]:
         "status": finished.status,
         "marking": mission.executor.state.marking,
         "runs": sorted((r.run, r.status, r.cause) for r in mission.tally.runs),
-        "cycles": [(c.number, c.status, c.cause) for c in mission.tally.cycles],
+        "cycles": [(c.number, c.status, c.worst[1]) for c in mission.tally.cycles],
         "firings": mission.tally.firings,
     }
 

@@ -107,7 +107,7 @@ def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_pat
         "the second on the first pick, and the one on a run that was sure"
     )
     assert set(mission.executor.state.deferred) == {"pick#6"} and not mission.executor.state.early
-    assert [(c.status, c.cause) for c in mission.tally.cycles] == list(TRULY.values())
+    assert [(c.status, c.worst[1]) for c in mission.tally.cycles] == list(TRULY.values())
     assert [(t.status, t.cause) for t in log.trials] == [(s.value, c) for s, c in TRULY.values()]
     assert [t.all_success for t in log.trials] == [s is OK for s, _ in TRULY.values()]
     assert {run: (timeline.bars[run].status, timeline.bars[run].cause) for run in TRULY} == TRULY

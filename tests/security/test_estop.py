@@ -30,7 +30,7 @@ from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
 from tests.node.test_processes import Nodes, operator_of, pids
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
-from tests.waiting import Limit, beat
+from tests.waiting import Limit, beat, until
 
 pytestmark = pytest.mark.processes
 LIMIT = 60.0
@@ -85,12 +85,6 @@ class Cell:
         services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
         task = str(self.folder / "sweeping.toml")
         return petrobot("run", task, "--runs", "3", *services, "--no-page", "--quiet", **variables)
-
-    async def until(self, holds: Callable[[], bool]) -> None:
-        """Wait until a condition holds."""
-        async with asyncio.timeout(LIMIT):
-            while not holds():
-                await beat()
 
     async def estop(self, *options: str) -> tuple[int, Any]:
         """Run `petrobot estop`; return its exit code and answers."""
@@ -207,7 +201,7 @@ async def test_a_stop_remains_after_its_node_is_killed(tmp_path: Path, answers: 
         assert (await finished(cell.coordinator))[0] == 1
         os.kill(cell.supervisor.process_ids()["motion"], signal.SIGKILL)
         log = tmp_path / "logs" / "motion.log"
-        await cell.until(lambda: log.read_text().count("motion ready on") == 2)
+        await until(lambda: log.read_text().count("motion ready on") == 2)
         assert "petrobot estop --clear" in log.read_text(), (
             "whoever starts it sees why nothing moves"
         )

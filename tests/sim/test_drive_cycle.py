@@ -28,6 +28,7 @@ from petrobot.services.comm.canopen.cia402 import (
 )
 from petrobot.sim.catching import drives
 from petrobot.sim.catching.drives import ArmBus, DriveRating, ServoDrive
+from tests.sim.test_bus import ENABLING
 from tests.waiting import Limit
 
 CYCLE = 0.004
@@ -142,11 +143,6 @@ class CycleBench:
             )
 
 
-WORDS = [
-    DriveCommand.SHUTDOWN.word,
-    DriveCommand.SWITCH_ON.word,
-    DriveCommand.ENABLE_OPERATION.word,
-]
 happenings = st.tuples(
     st.sampled_from(
         ["aim"] * 6 + ["trip", "power", "slow", "stop", "silence", "asynchronous", "order", "rest"]
@@ -165,7 +161,7 @@ def test_the_fast_path_sends_the_same_frames_as_the_steps(
         benches = [CycleBench(kind, monkeypatch) for kind in (ServoDrive, StepByStep)]
     quick = 0
     for bench in benches:
-        for word in WORDS * 2:
+        for word in ENABLING * 2:
             bench.cycle(word, None, False)
         for what, number, asks in course:
             bench.happen(what, number)
@@ -186,7 +182,7 @@ def test_a_bench_with_the_fast_drives_uses_the_fast_path() -> None:
     """Otherwise the comparison above would compare the slow path with itself."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         bench = CycleBench(ServoDrive, monkeypatch)
-    for word in WORDS + [WORDS[-1]] * 5:
+    for word in ENABLING + [ENABLING[-1]] * 5:
         bench.happen("aim", 11)
         bench.cycle(word, None, False)
     assert all(drive._said is not None for drive in bench.bus.drives)

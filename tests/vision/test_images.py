@@ -4,7 +4,7 @@ missing devices."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from petrobot.services.comm.streams.camera import (
     encode_image,
 )
 from petrobot.services.comm.streams.image import Image
+from tests.waiting import wait_for
 
 
 def grey(level: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
@@ -93,31 +94,20 @@ def receiver(server: ImageServer) -> Iterator[StreamImages]:
     images.close()
 
 
-def until(condition: Callable[[], object], *steps: Callable[[], object]) -> object:
-    """Repeat the steps until the condition holds; fails after ten seconds."""
-    deadline = time.monotonic() + 10.0
-    while time.monotonic() < deadline:
-        for step in steps:
-            step()
-        if (found := condition()) is not None and found is not False:
-            return found
-    raise AssertionError("it never came")
-
-
 def test_images_arrive_at_the_requested_rate_and_stop(
     server: ImageServer, receiver: StreamImages
 ) -> None:
     receiver.start(40.0)
-    until(lambda: server.rate == 40.0, server.poll, receiver.newest)
+    wait_for(lambda: server.rate == 40.0, server.poll, receiver.newest)
     sent = time.monotonic() - 0.125
     server.send(grey(9), 0.125)
-    image = until(receiver.newest, server.poll)
+    image = wait_for(receiver.newest, server.poll)
     assert isinstance(image, Image)
     assert np.array_equal(image.pixels, grey(9))
     assert image.time == pytest.approx(sent, abs=0.5) and image.time <= time.monotonic() - 0.125
     assert receiver.newest() is None
     receiver.stop()
-    until(lambda: server.rate == 0.0, server.poll)
+    wait_for(lambda: server.rate == 0.0, server.poll)
     server.send(grey(1), 0.0)
     assert receiver.newest() is None
 
@@ -128,7 +118,7 @@ def test_newest_wins_and_no_one_waits_for_a_slow_receiver(
     """A receiver that does not read misses images; the camera continues at once and memory does not
     grow."""
     receiver.start(50.0)
-    until(lambda: server.rate > 0.0, server.poll, receiver.newest)
+    wait_for(lambda: server.rate > 0.0, server.poll, receiver.newest)
     big = grey(0, (480, 640))
     for k in range(200):
         server.send(big + np.uint8(k), 0.0)
@@ -144,7 +134,7 @@ def test_newest_wins_and_no_one_waits_for_a_slow_receiver(
         server.poll()
         server.send(big, 0.0)
 
-    until(read, send)
+    wait_for(read, send)
     assert len(seen) < 100, "not all of what was missed"
     assert [image.sequence for image in seen] == sorted({image.sequence for image in seen})
 
@@ -153,13 +143,13 @@ def test_images_of_an_earlier_start_are_dropped(
     server: ImageServer, receiver: StreamImages
 ) -> None:
     receiver.start(50.0)
-    until(lambda: server.rate > 0.0, server.poll, receiver.newest)
+    wait_for(lambda: server.rate > 0.0, server.poll, receiver.newest)
     server.send(grey(1), 0.0)
     receiver.stop()
     receiver.start(25.0)
-    until(lambda: server.rate == 25.0, server.poll, receiver.newest)
+    wait_for(lambda: server.rate == 25.0, server.poll, receiver.newest)
     server.send(grey(2), 0.0)
-    image = until(receiver.newest, server.poll)
+    image = wait_for(receiver.newest, server.poll)
     assert isinstance(image, Image) and image.pixels[0, 0] == 2
 
 
@@ -169,15 +159,15 @@ def test_a_camera_that_goes_away_is_found_again() -> None:
     port = first.port
     receiver = StreamImages("127.0.0.1", port, lambda: clock[0])
     receiver.start(50.0)
-    until(lambda: first.rate > 0.0, first.poll, receiver.newest)
+    wait_for(lambda: first.rate > 0.0, first.poll, receiver.newest)
     first.close()
-    until(lambda: receiver._socket is None, receiver.newest)
+    wait_for(lambda: receiver._socket is None, receiver.newest)
     assert receiver.newest() is None
     second = ImageServer("127.0.0.1", port)
     clock[0] += 1.0
-    until(lambda: second.rate == 50.0, second.poll, receiver.newest)
+    wait_for(lambda: second.rate == 50.0, second.poll, receiver.newest)
     second.send(grey(5), 0.0)
-    assert until(receiver.newest, second.poll)
+    assert wait_for(receiver.newest, second.poll)
     receiver.close()
     second.close()
 
@@ -197,7 +187,7 @@ def test_the_server_disconnects_clients_that_send_malformed_bytes(server: ImageS
             except ConnectionError:
                 return True
 
-        until(gone, server.poll)
+        wait_for(gone, server.poll)
     assert server.rate == 0.0
 
 

@@ -42,6 +42,7 @@ from petrobot.coordinator.operator.port import Feed  # noqa: E402 - the bench ru
 from petrobot.coordinator.page.server import Page, start_page  # noqa: E402
 from tests.operator.conftest import SCRIPT, TASK, Cell  # noqa: E402
 from tests.page.conftest import ARGUMENTS, BROWSER  # noqa: E402
+from tests.waiting import until  # noqa: E402
 
 RATE = 50
 PROBE = """() => {
@@ -378,7 +379,7 @@ async def with_checks(places: int, seconds: float, rounds: int) -> dict[str, Any
         await cell.say("take_controls")
         page = await start_page(cell.station, tasks_folder=Path(folder) / "tasks")
         assert (await cell.say("start", task="moving"))["ok"]
-        await cell.until(lambda: cell.state["mission"]["firings"] > 100)
+        await until(lambda: cell.state["mission"]["firings"] > 100)
         turns: dict[str, list[dict[str, float]]] = {"alone": [], "checks": []}
         for _ in range(rounds):
             turns["alone"].append(await beside(page, cell.state, seconds, 0))

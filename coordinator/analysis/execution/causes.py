@@ -313,7 +313,7 @@ def _fates(
     x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle, known: set[int]
 ) -> Iterator[str]:
     """Yield where the tokens went that a transition lacks, or why no other transition makes room
-    for it. `known`: transitions of which it is told already what they lack."""
+    for it. `known`: transitions whose lack is already explained."""
     net = x.engine.compiled.net
     if one.place is None or one.kind not in ("short", "full"):
         return
@@ -383,8 +383,8 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
 
 
 def _elsewhere(net: Net, order: list[int], givers: list[int]) -> str:
-    """Return which firing took last what would have led to one of the givers of a place; empty if
-    none did."""
+    """Return the last firing that took a token on its way to one of the givers of a place; empty
+    if none did."""
     wanted, seen = set(givers), set[int]()
     while wanted:
         needed = {p for t in wanted for p, _ in net.consume[t] if not net.initial[p]} - seen

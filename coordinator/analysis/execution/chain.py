@@ -69,7 +69,7 @@ BAD = (Status.FAILURE, Status.ERROR)
 FIXED = 1e-9
 """Seconds for a timer of 0 s."""
 UNDIVIDED = 1_000_000
-"""Phases of a duration that is not divided; one with so many is fixed."""
+"""Number of phases that marks a duration as fixed: it is not divided into phases."""
 MISSIONS, MOVES, ENOUGH = 2_000, 60_000, 100
 """The most missions that are played, the most changes of a state in all of them, which take about a
 second, and the fewest missions that tell something."""

@@ -63,14 +63,14 @@ BETWEEN = 1_000
 PLAYS = 4
 """Of a graph that is too large, random plays follow a fourth as many stimuli and firings more."""
 SHORTEST, LENGTHS = 32, 6
-"""The lengths of plays, in turn: this one, then twice as long, so many times."""
+"""The shortest play, and the number of lengths: each is twice the one before."""
 RARE, KNOWN = 1e-6, 0.5
 """How likely a play takes an ERROR if it is careful, as each second one is, and a state that was
 explored before. Errors often end a mission, and then nothing deeper is seen."""
 STALE = 16
-"""After so many steps without a new state, a play goes on at the nearest one."""
+"""Steps without a new state after which a play continues at the nearest new one."""
 QUEUE = 16
-"""So many runs of a state count like one more firing. Else a queue that a timer fills for ever
+"""This many runs of a state count like one more firing. Else a queue that a timer fills for ever
 reaches thousands of runs, and each stimulus takes as long."""
 TIMELESS, UNSAFE = "timeless", "unsafe"
 """Keys of reports: transitions fire for ever, a place with one server gets a second token."""
@@ -462,7 +462,7 @@ class _Search:
         return edges
 
     def _nearest(self, i: int, edges: Mapping[int, Iterable[int]]) -> int:
-        """Return the nearest state after this one whose edges are not there; -1 if there is none:
+        """Return the nearest state after this one that is not explored; -1 if there is none:
         nothing else can be reached."""
         target, seen = self.edges[1], {i: None}
         for state in (todo := [i]):

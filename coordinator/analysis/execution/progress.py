@@ -590,7 +590,7 @@ class Progress:
 
     @cached_property
     def one_run_each(self) -> PropertyVerdict:
-        """No action place is entered while its run is there."""
+        """No action place is entered while it has a run."""
         for place, state in self.x.crowded.items():
             tokens = self.x.marked(state).get(place, 2)
             details = (

@@ -92,7 +92,7 @@ class Layout:
 
     @cached_property
     def telling(self) -> int:
-        """Number of the first words that tell any two reachable markings apart."""
+        """Number of the first words that suffice to distinguish any two reachable markings."""
         return 1 + max((w for p, w in enumerate(self.word) if p not in self.implied), default=0)
 
     @cached_property

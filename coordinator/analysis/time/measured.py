@@ -242,7 +242,7 @@ class Numbers:
         deadline = self.task.primitive_task_of(place.name).deadline
         deadline = min(deadline, inf if place.timeout is None else place.timeout)
         if any(e.share > 0 and not e.mean > 0 for e in estimates.values()):
-            return estimates, Estimate(0.0, deadline)  # it is told elsewhere which mean is missing
+            return estimates, Estimate(0.0, deadline)  # another message names the missing mean
         found, late = cut(estimates, deadline)
         if late:
             self.assumptions.append(

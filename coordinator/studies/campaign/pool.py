@@ -223,7 +223,7 @@ class ClusterPool:
         return self
 
     async def workers(self, least: int, patience: float) -> None:
-        """Wait until so many workers are available, and count them. Raises CampaignError after
+        """Wait until `least` workers are available, and count them. Raises CampaignError after
         `patience` s."""
         try:
             await self._client.wait_for_workers(least, timeout=patience)

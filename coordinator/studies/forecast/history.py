@@ -154,7 +154,7 @@ class Runs:
     preempted: NDArray[np.bool_]
     """A transition took its token while it was active."""
     censored: NDArray[np.bool_]
-    """It was cut off: only known to have lasted at least so long."""
+    """Whether it was cut off, so only its least duration is known."""
     took: Values
     """Seconds from the arrival of its token to its end; without what it waited for a device that
     the simulated net lets it wait for."""

@@ -42,7 +42,7 @@ Columns: TypeAlias = slice | Codes
 ALL = slice(None)
 _NEVER, _LEAST = np.iinfo(np.int64).max, np.iinfo(np.int64).min
 LONGEST = 10_000
-"""After so many firings at one time, or so many steps, a trial counts as one that never ends."""
+"""Firings at one time, or steps, after which a trial counts as one that never ends."""
 Choices = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
 

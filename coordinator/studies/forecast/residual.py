@@ -94,7 +94,7 @@ def _same_mean(one: Values, other: Values) -> float:
     means, spreads = [x.mean() for x in kept], [x.std(ddof=1) for x in kept]
     if max(spreads) <= EXACT * means[0]:
         return float(math.isclose(*means, rel_tol=EXACT))
-    # not ttest_ind: it warns where the times of one side are equal but for rounding
+    # not ttest_ind: it warns where the times of one side differ only by rounding
     stats = (
         x
         for mean, sd, times in zip(means, spreads, kept, strict=True)
@@ -227,7 +227,7 @@ LIKELY = 0.05
 """p-value of the asymptotic test above which no permutations are drawn."""
 PERMUTATIONS = 20_000
 AT_ONCE = 500
-"""At most so many are drawn at once; then it is checked whether more can matter."""
+"""Most permutations that are drawn at once, before the check whether more can matter."""
 VALUES = 2_000_000
 """Most values of the permutations that are drawn at once (16 MB)."""
 

@@ -205,8 +205,8 @@ def action_pictures(task: Task, estimates: Estimates) -> Pictures:
 
 
 LATENCY = "latency"
-"""Numbers of results whose names begin so are drawn as latencies: seconds from an image to the set
-point that it led to, for example."""
+"""Numbers of results whose names begin like this are drawn as latencies, for example the seconds
+from an image to its set point."""
 
 
 def add_latencies(found: dict[str, list[float]], action: str, values: Mapping[str, Any]) -> None:

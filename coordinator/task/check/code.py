@@ -308,7 +308,7 @@ def _causes(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
         return
     key = f"primitive_tasks.{primitive.name}.error_causes"
     possible = {cause for f in facts for cause in f["causes"]}
-    # A cause that stands in a variable is often one that the driver has found.
+    # A cause held in a variable often comes from the driver.
     open_ones = [f for f in facts if not f["complete"]]
     said = possible | {w for f in open_ones for w in (*f["words"], *f["device"].get("words", ()))}
     for cause in primitive.error_causes:

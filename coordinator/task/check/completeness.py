@@ -47,7 +47,7 @@ def uncovered_exits(task: Task) -> Iterator[Finding]:
 
 
 def _written(place: Place, ways: Iterable[Transition]) -> bool:
-    """Return whether there is an outgoing transition besides the retry of `tries`."""
+    """Return whether there is an outgoing transition other than the retry of `tries`."""
     return any(way.name != f"{place.name}.retry" for way in ways)
 
 

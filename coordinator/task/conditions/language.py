@@ -50,7 +50,7 @@ class ConditionError(ValueError):
         return f"{self.text} at column {self.at + 1} of {self.source!r}"
 
 
-class ConditionFault(Exception):  # noqa: N818 - not a bug: the values at hand give the condition no truth value
+class ConditionFault(Exception):  # noqa: N818 - not a bug: these values give the condition no truth value
     """A condition has no truth value for the present values (a name was never written, or holds a
     value of another type)."""
 

@@ -73,7 +73,7 @@ def pick(values: Any, path: str) -> Any:
 
 
 def filled(base: Mapping[str, Any], values: Mapping[str, Any]) -> Message:
-    """Return a copy of a message in which the values stand at their paths. Raises ValueError."""
+    """Return a copy of a message with the values set at their paths. Raises ValueError."""
     message = deepcopy(dict(base))
     for path, value in values.items():
         *tables, last = path.split(".")

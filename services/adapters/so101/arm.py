@@ -199,7 +199,7 @@ class Arm(Driver):
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         """Open the port. Raises ValueError for a wrong key or calibration file, ConnectionError if
-        the port is not there."""
+        the port is missing."""
         super().__init__(config, ports)
         self._check_keys()
         self.joints = [

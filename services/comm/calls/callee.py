@@ -595,7 +595,7 @@ class Callee:
         self._orders.append(command)
 
     def _known_command(self, peer: str, id_: str) -> None:
-        """Answer a repeated command with its stored answer, or not until the answer is there; never
+        """Answer a repeated command with its stored answer, or as soon as there is one; never
         carry it out twice."""
         if (answer := self._answers.get((peer, id_))) is not None:
             self._messages.append((peer, answer))
@@ -725,7 +725,7 @@ class Callee:
         return None if run is None else run.call.service
 
     def why_stopped(self, id_: str, cause: str) -> str:
-        """Return in words why an active run is stopped: it is over its deadline or an orphan."""
+        """Return in words why an active run is stopped: it passed its deadline or is an orphan."""
         run = self._running[id_]
         if cause == ORPHAN:
             away = f"its coordinator was away for {run.orphan_time:g} s"

@@ -44,9 +44,9 @@ class Patience:
     reconnect: float = 2.0
     """For a lost connection to come back, before its calls end."""
     again: float = 2.0
-    """Between two calls that fail at once because the peer is not there; calls in between wait for
-    it. `petrobot up` takes about 2.5 s to start a dead node again: three tries reach it. An action
-    of a node that stays away holds a task up for so long."""
+    """Between two calls that fail at once because the peer is absent; calls in between wait.
+    `petrobot up` takes about 2.5 s to start a dead node again: three tries reach it. An action of a
+    node that stays away delays its task by this time."""
     accept: float = 1.0
     """For ACCEPT."""
     stop: float = 5.0

@@ -36,7 +36,7 @@ LEASED: Final = "device_leased"
 """Cause of a refusal: another caller holds the lease of the device."""
 OVERTAKEN: Final = "device_overtaken"
 """Cause of a refusal: this coordinator lost the device while it was away, and another one has used
-it since, so nobody knows where it stands."""
+it since, so its position is unknown."""
 KNOWN: Final = 256
 """How many callers are remembered after their connection closed, and how many lost leases."""
 

@@ -61,7 +61,7 @@ class TokenBucket:
         self._level, self._at = burst, now
 
     def level(self, now: float) -> float:
-        """Return how many tokens are left; below 0, so many were taken in advance."""
+        """Return how many tokens are left; below 0, how many were taken in advance."""
         self._level = min(self._burst, self._level + (now - self._at) * self._rate)
         self._at = now
         return self._level

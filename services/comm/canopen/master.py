@@ -89,7 +89,7 @@ class Supervision:
     silent_cycles: int
     """Cycles without its TPDO after which a drive counts as lost."""
     patience: float
-    """A node counts as lost after so long without a heartbeat (s)."""
+    """Time without a heartbeat after which a node counts as lost (s)."""
     old_emergencies: bool = False
     """Whether an EMCY that arrives during a reset is ignored: a fault that persists shows in the
     status anyway."""

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Final, Protocol
 
 BACKLOG: Final = 65536
-"""Most bytes that wait to be sent: a line that accepts none for so long is broken. Also most bytes
+"""Most bytes that wait to be sent: a line with more of them is broken. Also most bytes
 that one `receive` of a TCP connection returns."""
 CONNECTING: Final = 2.0
 """Seconds that a TCP connection may take to be made."""

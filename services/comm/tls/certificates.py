@@ -26,8 +26,8 @@ CA_NAME = "petrobot cell authority"
 CA_LIFE = timedelta(days=3650)
 LIFE = timedelta(days=1095)
 CLOCKS = timedelta(days=1)
-"""How much the clocks of hosts may differ: a certificate is valid from so long before it was
-made."""
+"""Largest difference between the clocks of hosts: a certificate is valid from this time before
+it was made."""
 
 
 class CertificateError(Exception):

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import threading
-import time
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from typing import Any
@@ -15,7 +13,6 @@ import numpy as np
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.canopen.cia301 import DataType, heartbeat, sdo_write_request
 from petrobot.services.comm.canopen.cia301 import NmtState as Network
 from petrobot.services.comm.canopen.cia402 import (
@@ -30,12 +27,13 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.sim.track.drives import Echo, ReflectorSensor, RoverBus
 from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.truth import TrackSite
+from tests.motion.conftest import canopen_network, live_drives
+from tests.waiting import wait_for
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
 DRIVE_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("wheel_drive.eds"))
 SENSOR_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("reflector_sensor.eds"))
-PATIENCE = 10.0
 U16, U32, I32 = DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.INTEGER32
 
 Bench = Callable[..., Any]
@@ -220,62 +218,15 @@ def test_a_tpdo_carries_the_two_nearest_echoes() -> None:
 # Another master
 
 
-class LiveRover:
-    """Our drives on a hub, run by a thread; simulated time follows the wall clock."""
-
-    def __init__(self, site: TrackSite) -> None:
-        truth = site.truth("plain")
-        self.hub = CanHub()
-        self.channel = self.hub.channel
-        self.rover = RoverBody(truth.rover, np.random.default_rng(1))
-        self.bus = RoverBus(self.rover, ReflectorSensor(lambda now: [Echo(0.25, 2.0)]))
-        self._port = self.hub.port()
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._live)
-        self._thread.start()
-
-    def _live(self) -> None:
-        start = time.monotonic()
-        while not self._over.is_set():
-            self.hub.poll(0.001)
-            now = time.monotonic() - start
-            for frame in self._port.receive():
-                self.bus.receive(now, frame)
-            self.bus.step(now)
-            for frame in self.bus.drain():
-                self._port.send(frame)
-        self.hub.close()
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
+@pytest.fixture
+def rover_bus(track_site: TrackSite) -> RoverBus:
+    body = RoverBody(track_site.truth("plain").rover, np.random.default_rng(1))
+    return RoverBus(body, ReflectorSensor(lambda now: [Echo(0.25, 2.0)]))
 
 
 @pytest.fixture
-def live(track_site: TrackSite) -> Iterator[LiveRover]:
-    rover = LiveRover(track_site)
-    yield rover
-    rover.close()
-
-
-@pytest.fixture
-def network(live: LiveRover) -> Iterator[Any]:
-    network = canopen.Network()
-    network.connect(interface="petrobot_stream", channel=live.channel)
-    yield network
-    for node in network.values():
-        if node.id < 3:
-            node.rpdo[1].stop()
-    network.sync.stop()
-    network.disconnect()
-
-
-def _until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    pause = threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline, what
-        pause.wait(0.005)
+def network(rover_bus: RoverBus) -> Iterator[Any]:
+    yield from canopen_network(live_drives(rover_bus, rover_bus.step))
 
 
 def _configured(network: Any, number: int) -> Any:
@@ -298,14 +249,14 @@ def _configured(network: Any, number: int) -> Any:
     return node
 
 
-def test_the_canopen_package_masters_our_wheel_drive(live: LiveRover, network: Any) -> None:
+def test_the_canopen_package_masters_our_wheel_drive(rover_bus: RoverBus, network: Any) -> None:
     node = _configured(network, 2)
     assert node.sdo[0x1000].raw == 0x00020192
     assert node.sdo[0x6502].raw == 1 << 8
     assert node.sdo[0x6061].raw == 9
     network.sync.start(0.02)
     node.nmt.state = "OPERATIONAL"
-    _until(lambda: bool(node.tpdo[1].timestamp), "no TPDO came")
+    wait_for(lambda: bool(node.tpdo[1].timestamp), awaited="a TPDO")
     node.rpdo[1][0x60FF].raw = 0
     node.rpdo[1].start(0.02)
     for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
@@ -313,23 +264,25 @@ def test_the_canopen_package_masters_our_wheel_drive(live: LiveRover, network: A
         assert node.state == state
     node.rpdo[1][0x60FF].raw = 3_000_000
     node.rpdo[1].update()
-    _until(lambda: abs(live.rover.wheels[1].speed - 3.0) < 0.05, "the wheel does not turn as told")
-    _until(
-        lambda: abs(node.tpdo[1][0x606C].raw - 3_000_000) < 400_000,
-        "the drive does not tell its speed",
+    wait_for(
+        lambda: abs(rover_bus.rover.wheels[1].speed - 3.0) < 0.05, awaited="the commanded speed"
     )
-    assert live.rover.wheels[0].speed == 0.0
+    wait_for(
+        lambda: abs(node.tpdo[1][0x606C].raw - 3_000_000) < 400_000,
+        awaited="the reported speed",
+    )
+    assert rover_bus.rover.wheels[0].speed == 0.0
     with pytest.raises(canopen.SdoAbortedError) as refused:
         node.sdo[0x6060].raw = 8
     assert refused.value.code in (0x06090030, 0x08000022)
     assert 20_000 < node.sdo[0x6079].raw < 26_000
-    live.bus.trip(1, DriveFault.OVERHEATED)
-    _until(lambda: bool(node.emcy.log), "no EMCY came")
+    rover_bus.trip(1, DriveFault.OVERHEATED)
+    wait_for(lambda: bool(node.emcy.log), awaited="an EMCY")
     assert node.emcy.log[0].code == DriveFault.OVERHEATED
-    _until(lambda: live.rover.wheels[1].braked, "the brake does not fall in")
+    wait_for(lambda: rover_bus.rover.wheels[1].braked, awaited="the brake")
 
 
-def test_the_canopen_package_reads_our_sensor(live: LiveRover, network: Any) -> None:
+def test_the_canopen_package_reads_our_sensor(rover_bus: RoverBus, network: Any) -> None:
     node = canopen.RemoteNode(3, SENSOR_EDS)
     network.add_node(node)
     node.sdo.RESPONSE_TIMEOUT = 2.0
@@ -337,5 +290,5 @@ def test_the_canopen_package_reads_our_sensor(live: LiveRover, network: Any) -> 
     node.tpdo[1].cob_id, node.tpdo[1].enabled = 0x183, True
     node.tpdo.save()
     node.nmt.state = "OPERATIONAL"
-    _until(lambda: bool(node.tpdo[1].timestamp), "no TPDO came")
+    wait_for(lambda: bool(node.tpdo[1].timestamp), awaited="a TPDO")
     assert [variable.raw for variable in node.tpdo[1]] == [2500, 2000, 0, 0]

@@ -10,8 +10,6 @@ import select
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,7 @@ from petrobot.coordinator.studies.campaign.plan import CampaignPlan, write_manif
 from petrobot.coordinator.studies.campaign.table import held, times
 from tests.processes import children
 from tests.studies.campaign.conftest import HERE, SERVICES, TASK
-from tests.waiting import Limit
+from tests.waiting import Limit, wait_for
 
 ROOT = HERE.parents[1]
 TOY = [str(TASK), "--services", str(SERVICES)]
@@ -214,7 +212,7 @@ def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
 
     part = start(*arguments, "--out", "part")
     table = tmp_path / "part" / "table.csv"
-    _until(lambda: part.poll() is not None or (table.exists() and b"\n" in table.read_bytes()))
+    wait_for(lambda: part.poll() is not None or (table.exists() and b"\n" in table.read_bytes()))
     part.kill()
     part.wait()
     assert 0 < table.read_bytes().count(b"\n") < 61
@@ -276,7 +274,7 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
         stderr=subprocess.DEVNULL,
     )
     try:
-        _until(lambda: _frozen_with_its_workers_at_work(campaign, tmp_path / "part"))
+        wait_for(lambda: _frozen_with_its_workers_at_work(campaign, tmp_path / "part"))
         workers = [os.pidfd_open(pid) for pid in children(campaign.pid)]
         for worker in workers:
             signal.pidfd_send_signal(worker, signal.SIGSTOP)
@@ -301,14 +299,6 @@ def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: 
         return True
     campaign.send_signal(signal.SIGCONT)
     return False
-
-
-def _until(condition: Callable[[], bool]) -> None:
-    """Wait for the condition, at most a minute."""
-    over = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < over
-        select.select([], [], [], 0.01)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 // Puts the page together: header, tabs, theme, and one painter for all that the link brings.
 
-import { Canvas } from "./canvas.js";
 import { Designer } from "./design/designer.js";
 import { attribute, h, text } from "./dom.js";
 import { History } from "./history.js";

@@ -1,6 +1,5 @@
 // A task file's document while it is drawn: plain data, edits with undo, and the net that it describes.
 
-import { words } from "../dom.js";
 import { listed, readArc, repoint, writeArc } from "./arcs.js";
 import { drawn } from "./drawn.js";
 import { around, group, groups, members, own, ungroup, within } from "./macros.js";
