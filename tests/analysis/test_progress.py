@@ -186,6 +186,47 @@ STUCK: dict[str, Case] = {
             "boxes: only `dropped`, `fallen` can fill it, but `lost` took grasp",
         ),
     ),
+    "the last step of a branch that several exits enter loses the arm": Case(
+        "jobs=2 arm~=1 reach! home!",
+        {
+            "start": {"in": "jobs arm", "out": "reach"},
+            "reached": {"in": "reach:normal", "out": "arm"},
+            "bark": {"in": "reach:preempt=error", "out": "home", "event": "bell"},
+            "fail": {"in": "reach:error", "out": "home"},
+            "homed": {"in": "home:normal", "out": ""},
+            "again": {"in": "home:error", "out": "home"},
+        },
+        "jobs == 0 and arm == 1",
+        ("start needs arm, which is empty: taken by `start`, never returned by `homed`",),
+        "bell",
+    ),
+    "an exit leaves a token of its step behind": Case(
+        "jobs=2 arm~=1 reach! dog",
+        {
+            "start": {"in": "jobs arm", "out": "reach dog"},
+            "reached": {"in": "reach:normal", "out": "arm"},
+            "bark": {"in": "dog reach:preempt=error", "out": "arm", "event": "bell"},
+            "fail": {"in": "dog reach:error", "out": "arm"},
+        },
+        "jobs == 0 and arm == 1 and dog == 0",
+        ("reach: taken by `reached`, which left dog",),
+        "bell",
+    ),
+    "what is barred comes after the step that would remove the bar": Case(
+        "jobs=3 bay~=2 wait want cross! busy",
+        {
+            "send": {"in": "jobs", "out": "wait"},
+            "enter": {"in": "wait !busy", "out": "want busy"},
+            "go": {"in": "want bay", "out": "cross"},
+            "left": {"in": "cross:normal busy", "out": "bay"},
+            "lost": {"in": "cross:error busy", "out": "wait"},
+        },
+        "jobs == 0 and bay == 2",
+        (
+            "go needs bay, which is empty",
+            "go needs bay, which is empty: taken by `go`, never returned by `lost`",
+        ),
+    ),
     "a capacity bars the way for good": Case(
         "go=2 look! box/1",
         {
@@ -263,6 +304,13 @@ STUCK |= {
     ),
     "an arc takes two parts at once": seeded(
         "next needs 2 of parts, which holds 1", next={"in": "parts*2 arm camera"}
+    ),
+    "a branch that tries again loses what it takes again": seeded(
+        "grasped needs tray, which is empty: taken by `grasped`, never returned by `dropped`",
+        cell=f"{CELL} tray=1",
+        grasped={"in": "grasp:normal tray"},
+        dropped={"out": "grasp"},
+        placed={"out": "arm done tray"},
     ),
     "an error branch is missing": seeded(
         "no transition takes what ended in place that way", dropped={"in": "place:normal"}
