@@ -374,6 +374,20 @@ def test_of_the_copies_that_tries_makes_only_the_nearest_is_told() -> None:
     assert verdict.details[0] == "tray: taken by `seen`, and no transition returns it"
 
 
+def test_a_run_that_can_still_end_is_not_what_is_stuck() -> None:
+    """`again` only waits for the run to end in another way."""
+    net: dict[str, dict[str, Any]] = {
+        "begin": {"in": "parts spare", "out": "put"},
+        "laid": {"in": "put:normal", "out": "put"},
+        "again": {"in": "put:error left", "out": "put left"},
+        "full": {"in": "count", "out": "spare"},
+    }
+    task = make_task("parts=2 spare~=1 left=1 put! count", net, final="parts == 0 and spare == 1")
+    assert judged(task).sound.reason == (
+        "stuck with parts left put: begin needs spare, which is empty"
+    )
+
+
 @pytest.mark.parametrize(
     ("steps", "told"),
     [

@@ -107,8 +107,7 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     lacks = list[Lack]()
     for t in _by_copy(draft, waiting):
         found = obstacles(draft, t)
-        own = [one for one in found if one.kind != "run"]
-        if own or not ended:
+        if own := [one for one in found if one.kind != "run"]:
             lacks.append((t, own, len(found)))
     if not lacks and ended:
         names = ", ".join(sorted(ended))
@@ -435,9 +434,9 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
     The net as it was meant returns what it takes: weights y >= 0 exist that every firing keeps. So
     the y that the fewest transitions of the real net change (least sum of |y C|, a linear program)
     show the transition that is wrong. What takes or gives tokens of the place itself is believed
-    first. No place is weighed that nothing takes from, except an end of the task (`ends`), and none
-    that has tokens at the beginning, such as another resource: a token that arrives there was
-    returned.
+    first; what gives nothing at all, last. No place is weighed that nothing takes from, except an
+    end of the task (`ends`), and none that has tokens at the beginning, such as another resource: a
+    token that arrives there was returned.
     """
     from scipy.optimize import linprog
 
@@ -453,7 +452,8 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
             if p in column:
                 equal[t, column[p]] = c
         equal[t, n + 2 * t], equal[t, n + 2 * t + 1] = 1.0, -1.0
-        cost[n + 2 * t : n + 2 * t + 2] = 100.0 if dict(own).get(place) else 1.0
+        doubt = 100.0 if dict(own).get(place) else 1.0 if net.produce[t] else 0.9
+        cost[n + 2 * t : n + 2 * t + 2] = doubt
     bounds = [(1.0, 1.0), *[(0.0, None)] * (n - 1 + 2 * m)]
     found = linprog(cost, A_eq=equal, b_eq=np.zeros(m), bounds=bounds, method="highs")
     weights = found.x if found.status == 0 else np.zeros(n)
