@@ -1611,7 +1611,7 @@ def test_a_resource_that_an_ended_run_keeps_is_told_with_what_that_run_lacks() -
     assert "look has ended: seen needs cup, which is empty" in verdict.details
 
 
-def crossed(steps: int, door: bool) -> Task:
+def crossed(steps: int, door: bool, stop: bool = False) -> Task:
     """Return a task of two arms that each make some steps, then take two tools in opposite order.
     Beside them a door opens and closes for ever, or three lamps shine a few times."""
     text = """schema = 1
@@ -1648,6 +1648,12 @@ open = { listen = true }
     if door:
         arcs.append('opened = { in = ["shut"], out = ["open"], event = "opens" }')
         arcs.append('closed = { in = ["open"], out = ["shut"], event = "closes" }')
+    if stop:
+        text = text.replace(
+            "[events]\n", '[events]\nstop = { memory = "latched", early = "keep" }\n'
+        )
+        places.append("running = { tokens = 1, listen = true }")
+        arcs.append('halt = { in = ["running"], out = ["broken"], event = "stop" }')
     for lamp in () if door else ("red", "green", "blue"):
         places.append(f"{lamp}_left = {{ tokens = 4 }}")
         places.append(f'{lamp} = {{ kind = "action", task = "move" }}')
@@ -1688,3 +1694,12 @@ def test_a_dead_end_far_from_the_beginning_is_found_by_random_plays(
     assert (again.x.states, again.x.steps) == (found.x.states, found.x.steps)
     monkeypatch.setattr(graph, "PLAYS", limit + 1)  # so that there are none
     assert progress_of(view, limit).sound.holds is None
+
+
+@pytest.mark.parametrize(("steps", "limit"), [(12, 9_000), (20, 9_000)])
+def test_a_stop_button_does_not_hide_what_random_plays_find(steps: int, limit: int) -> None:
+    """Most plays press it, and after it `final` is out of reach: careful ones do not."""
+    found = progress_of(OrdinaryView(crossed(steps, door=True, stop=True)), limit)
+    assert not found.x.complete and found.sound.holds is False
+    told = " ".join((found.sound.reason, *found.sound.details))
+    assert "needs knife, which is empty" in told and "needs pen, which is empty" in told

@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
+from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, conjuncts
 from petrobot.coordinator.analysis.execution.names import cases
 from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Obstacle, in_words, obstacles
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
-from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
-from petrobot.coordinator.task.conditions.language import Node, as_literal
+from petrobot.coordinator.task.conditions import Compare, Expression, Literal, Name
+from petrobot.coordinator.task.conditions.language import as_literal
 from petrobot.coordinator.task.net import EMPTY, Net
 
 MOST = 4
@@ -291,7 +291,7 @@ def _asked(
     task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
     held = {name: draft.marking[p] for name, p in index.items()}
     missed, spent, left, gone = list[str](), set[int](), set[int](), list[str]()
-    for node in _conjuncts(task.final.tree):
+    for node in conjuncts(task.final.tree):
         if not (isinstance(node, Compare) and isinstance(node.left, Name)):
             missed += [str(task.final)] * (not Expression("", node).holds(held))
             continue
@@ -312,14 +312,6 @@ def _asked(
     ends = [" and ".join(dict.fromkeys(missed))]
     ends += [str(task.final_error)] if task.final_error is not None else []
     return ", or for ".join(ends), spent, left, tuple(gone)
-
-
-def _conjuncts(node: Node) -> Iterator[Node]:
-    if isinstance(node, And):
-        for operand in node.operands:
-            yield from _conjuncts(operand)
-    else:
-        yield node
 
 
 def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> bool:
