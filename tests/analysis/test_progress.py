@@ -186,6 +186,47 @@ STUCK: dict[str, Case] = {
             "boxes: only `dropped`, `fallen` can fill it, but `lost` took grasp",
         ),
     ),
+    "the last step of a branch that several exits enter loses the arm": Case(
+        "jobs=2 arm~=1 reach! home!",
+        {
+            "start": {"in": "jobs arm", "out": "reach"},
+            "reached": {"in": "reach:normal", "out": "arm"},
+            "bark": {"in": "reach:preempt=error", "out": "home", "event": "bell"},
+            "fail": {"in": "reach:error", "out": "home"},
+            "homed": {"in": "home:normal", "out": ""},
+            "again": {"in": "home:error", "out": "home"},
+        },
+        "jobs == 0 and arm == 1",
+        ("start needs arm, which is empty: taken by `start`, never returned by `homed`",),
+        "bell",
+    ),
+    "an exit leaves a token of its step behind": Case(
+        "jobs=2 arm~=1 reach! dog",
+        {
+            "start": {"in": "jobs arm", "out": "reach dog"},
+            "reached": {"in": "reach:normal", "out": "arm"},
+            "bark": {"in": "dog reach:preempt=error", "out": "arm", "event": "bell"},
+            "fail": {"in": "dog reach:error", "out": "arm"},
+        },
+        "jobs == 0 and arm == 1 and dog == 0",
+        ("reach: taken by `reached`, which left dog",),
+        "bell",
+    ),
+    "what is barred comes after the step that would remove the bar": Case(
+        "jobs=3 bay~=2 wait want cross! busy",
+        {
+            "send": {"in": "jobs", "out": "wait"},
+            "enter": {"in": "wait !busy", "out": "want busy"},
+            "go": {"in": "want bay", "out": "cross"},
+            "left": {"in": "cross:normal busy", "out": "bay"},
+            "lost": {"in": "cross:error busy", "out": "wait"},
+        },
+        "jobs == 0 and bay == 2",
+        (
+            "go needs bay, which is empty",
+            "go needs bay, which is empty: taken by `go`, never returned by `lost`",
+        ),
+    ),
     "a capacity bars the way for good": Case(
         "go=2 look! box/1",
         {
@@ -264,6 +305,13 @@ STUCK |= {
     "an arc takes two parts at once": seeded(
         "next needs 2 of parts, which holds 1", next={"in": "parts*2 arm camera"}
     ),
+    "a branch that tries again loses what it takes again": seeded(
+        "grasped needs tray, which is empty: taken by `grasped`, never returned by `dropped`",
+        cell=f"{CELL} tray=1",
+        grasped={"in": "grasp:normal tray"},
+        dropped={"out": "grasp"},
+        placed={"out": "arm done tray"},
+    ),
     "an error branch is missing": seeded(
         "no transition takes what ended in place that way", dropped={"in": "place:normal"}
     ),
@@ -324,6 +372,20 @@ def test_of_the_copies_that_tries_makes_only_the_nearest_is_told() -> None:
     verdict = judged(replace(task, places={**task.places, "look": look})).deadlock_free
     assert verdict.reason.endswith(": seen needs tray, which is empty")
     assert verdict.details[0] == "tray: taken by `seen`, and no transition returns it"
+
+
+def test_a_run_that_can_still_end_is_not_what_is_stuck() -> None:
+    """`again` only waits for the run to end in another way."""
+    net: dict[str, dict[str, Any]] = {
+        "begin": {"in": "parts spare", "out": "put"},
+        "laid": {"in": "put:normal", "out": "put"},
+        "again": {"in": "put:error left", "out": "put left"},
+        "full": {"in": "count", "out": "spare"},
+    }
+    task = make_task("parts=2 spare~=1 left=1 put! count", net, final="parts == 0 and spare == 1")
+    assert judged(task).sound.reason == (
+        "stuck with parts left put: begin needs spare, which is empty"
+    )
 
 
 @pytest.mark.parametrize(
@@ -1549,7 +1611,7 @@ def test_a_resource_that_an_ended_run_keeps_is_told_with_what_that_run_lacks() -
     assert "look has ended: seen needs cup, which is empty" in verdict.details
 
 
-def crossed(steps: int, door: bool) -> Task:
+def crossed(steps: int, door: bool, stop: bool = False) -> Task:
     """Return a task of two arms that each make some steps, then take two tools in opposite order.
     Beside them a door opens and closes for ever, or three lamps shine a few times."""
     text = """schema = 1
@@ -1586,6 +1648,12 @@ open = { listen = true }
     if door:
         arcs.append('opened = { in = ["shut"], out = ["open"], event = "opens" }')
         arcs.append('closed = { in = ["open"], out = ["shut"], event = "closes" }')
+    if stop:
+        text = text.replace(
+            "[events]\n", '[events]\nstop = { memory = "latched", early = "keep" }\n'
+        )
+        places.append("running = { tokens = 1, listen = true }")
+        arcs.append('halt = { in = ["running"], out = ["broken"], event = "stop" }')
     for lamp in () if door else ("red", "green", "blue"):
         places.append(f"{lamp}_left = {{ tokens = 4 }}")
         places.append(f'{lamp} = {{ kind = "action", task = "move" }}')
@@ -1626,3 +1694,12 @@ def test_a_dead_end_far_from_the_beginning_is_found_by_random_plays(
     assert (again.x.states, again.x.steps) == (found.x.states, found.x.steps)
     monkeypatch.setattr(graph, "PLAYS", limit + 1)  # so that there are none
     assert progress_of(view, limit).sound.holds is None
+
+
+@pytest.mark.parametrize(("steps", "limit"), [(12, 9_000), (20, 9_000)])
+def test_a_stop_button_does_not_hide_what_random_plays_find(steps: int, limit: int) -> None:
+    """Most plays press it, and after it `final` is out of reach: careful ones do not."""
+    found = progress_of(OrdinaryView(crossed(steps, door=True, stop=True)), limit)
+    assert not found.x.complete and found.sound.holds is False
+    told = " ".join((found.sound.reason, *found.sound.details))
+    assert "needs knife, which is empty" in told and "needs pen, which is empty" in told

@@ -3,20 +3,21 @@ and which path should have returned it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
+from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, conjuncts
 from petrobot.coordinator.analysis.execution.names import cases
 from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Obstacle, in_words, obstacles
 from petrobot.coordinator.task import Kind
 from petrobot.coordinator.task.compiled_task import CompiledTransition
-from petrobot.coordinator.task.conditions import And, Compare, Expression, Literal, Name
-from petrobot.coordinator.task.conditions.language import Node, as_literal
+from petrobot.coordinator.task.conditions import Compare, Expression, Literal, Name
+from petrobot.coordinator.task.conditions.language import as_literal
 from petrobot.coordinator.task.net import EMPTY, Net
 
 MOST = 4
@@ -106,8 +107,7 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     lacks = list[Lack]()
     for t in _by_copy(draft, waiting):
         found = obstacles(draft, t)
-        own = [one for one in found if one.kind != "run"]
-        if own or not ended:
+        if own := [one for one in found if one.kind != "run"]:
             lacks.append((t, own, len(found)))
     if not lacks and ended:
         names = ", ".join(sorted(ended))
@@ -117,15 +117,8 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     if not lacks:
         text = f"no transition takes what is left, and the end asks for {missed}"
         return Explanation(text, gone)
-    # What waits for a token that another of them could move comes last; first, what lacks least.
-    takes = {t.index: {p for p, _ in t.needs} for t, _, _ in lacks}
-    follows = {
-        t.index
-        for t, own, _ in lacks
-        for p in _short(own)
-        for held in [_held(net, draft, _since(net, firings, p))]
-        if any(not places.isdisjoint(held) for u, places in takes.items() if u != t.index)
-    }
+    # What waits for another of them comes last; first, what lacks least.
+    follows = _followers(net, draft, firings, lacks)
     lacks.sort(key=lambda one: (one[0].index in follows, one[2], _rank(net, one[0], one[1])))
     told = [
         f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in own)}"
@@ -135,9 +128,9 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     known = {t.index for t, _, _ in lacks}
     fates = [
         fate
-        for _, own, _ in lacks[:MOST]
+        for t, own, _ in lacks[:MOST]
         for one in own
-        for fate in _fates(x, draft, firings, one, known)
+        for fate in _fates(x, draft, firings, t, one, known)
     ]
     fates += [
         line
@@ -146,9 +139,46 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
         for line in _values(draft, t, firings)
     ]
     # A place that the end wants empty is not to be filled: what else the end asks for comes first.
-    spare = not ended and any(one.place in spent for one in lacks[0][1])
+    spare = not ended and all(any(one.place in spent for one in own) for _, own, _ in lacks)
     first = f"the end asks for {missed}, and {told[0]}" if spare else told[0]
     return Explanation(first, (*told[1:MOST], *more, *dict.fromkeys(fates)))
+
+
+def _followers(net: Net, draft: Draft, firings: tuple[str, ...], lacks: Sequence[Lack]) -> set[int]:
+    """Return which of these transitions only wait for another one: it would move the tokens that
+    they lack, or those that bar them. Of two that wait for each other, neither follows."""
+    takes = {t.index: {p for p, _ in t.needs if draft.marking[p]} for t, _, _ in lacks}
+    waits = {
+        t.index: {
+            u
+            for one in own
+            if one.place is not None
+            for u, places in takes.items()
+            if u != t.index and not places.isdisjoint(_movers(net, draft, firings, one))
+        }
+        for t, own, _ in lacks
+    }
+    reach = {t: _reached(waits, t) for t in waits}
+    return {t for t, others in reach.items() if any(t not in reach[u] for u in others)}
+
+
+def _movers(net: Net, draft: Draft, firings: tuple[str, ...], one: Obstacle) -> set[int]:
+    """Return the marked places whose tokens must move before this obstacle goes away."""
+    place = one.place or 0
+    if one.kind != "short":
+        return {place}
+    if net.initial[place]:
+        return set(_held(net, draft, firings, place))
+    return {p for p in _leading(net, place) if draft.marking[p]}
+
+
+def _reached(edges: Mapping[int, set[int]], start: int) -> set[int]:
+    reached, todo = set[int](), [start]
+    while todo:
+        new = edges[todo.pop()] - reached
+        reached |= new
+        todo += new
+    return reached
 
 
 def fate(x: ExecutionGraph, state: int, place: int) -> str:
@@ -261,7 +291,7 @@ def _asked(
     task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
     held = {name: draft.marking[p] for name, p in index.items()}
     missed, spent, left, gone = list[str](), set[int](), set[int](), list[str]()
-    for node in _conjuncts(task.final.tree):
+    for node in conjuncts(task.final.tree):
         if not (isinstance(node, Compare) and isinstance(node.left, Name)):
             missed += [str(task.final)] * (not Expression("", node).holds(held))
             continue
@@ -284,14 +314,6 @@ def _asked(
     return ", or for ".join(ends), spent, left, tuple(gone)
 
 
-def _conjuncts(node: Node) -> Iterator[Node]:
-    if isinstance(node, And):
-        for operand in node.operands:
-            yield from _conjuncts(operand)
-    else:
-        yield node
-
-
 def _near(t: CompiledTransition, ended: set[str], marking: Sequence[int]) -> bool:
     if ended:
         return any(arc.name in ended for arc in t.actions)
@@ -310,7 +332,12 @@ def _at_rest(draft: Draft, t: CompiledTransition) -> bool:
 
 
 def _fates(
-    x: ExecutionGraph, draft: Draft, firings: tuple[str, ...], one: Obstacle, known: set[int]
+    x: ExecutionGraph,
+    draft: Draft,
+    firings: tuple[str, ...],
+    t: CompiledTransition,
+    one: Obstacle,
+    known: set[int],
 ) -> Iterator[str]:
     """Yield where the tokens went that a transition lacks, or why no other transition makes room
     for it. `known`: transitions whose lack is already explained."""
@@ -319,22 +346,44 @@ def _fates(
         return
     name = net.places[one.place]
     if one.kind == "short":
-        yield f"{name}: {_fate(net, draft, firings, one.place)}"
+        left = _left_behind(net, draft, firings, t, one.place)
+        yield f"{name}: {left or _fate(net, draft, firings, one.place)}"
         return
     takers = [
         t for t, changes in enumerate(net.compiled.changes) if dict(changes).get(one.place, 0) < 0
     ]
     if not takers:
         yield f"{name}: no transition takes any out of it"
-    for t in () if known.intersection(takers) else takers:
-        taker = x.engine.compiled.transitions[t]
+    for u in () if known.intersection(takers) else takers:
+        taker = x.engine.compiled.transitions[u]
         lacks = [lack for lack in obstacles(draft, taker) if lack.kind != "run"]
         words = " and ".join(obstacle_text(draft, taker, lack) for lack in lacks)
         if lacks:
             yield f"{name}: `{taker.name}` would take some out of it, but it {words}"
         for lack in lacks:
             if lack.kind == "short":
-                yield from _fates(x, draft, firings, lack, known)
+                yield from _fates(x, draft, firings, taker, lack, known)
+
+
+def _left_behind(
+    net: Net, draft: Draft, firings: tuple[str, ...], t: CompiledTransition, place: int
+) -> str:
+    """Return which firing took the last token of a step and left behind what `t` takes with it;
+    empty if none did, if the step can still be reached, and for a place that has tokens at the
+    beginning."""
+    if net.initial[place]:
+        return ""
+    with_it = {p for p, _ in t.needs if draft.marking[p] and not net.initial[p]} - {place}
+    if any(draft.marking[p] for p in _leading(net, place) - with_it):
+        return ""
+    for f in (net.transition_index[name] for name in reversed(firings)):
+        if any(p == place for p, _ in net.consume[f]):
+            left = [net.places[p] for p in sorted(with_it)]
+            return (
+                f"taken by `{net.transitions[f]}`, which left {' and '.join(left)}" if left else ""
+            )
+        with_it -= {p for p, c in net.compiled.changes[f] if c > 0}
+    return ""
 
 
 def _since(net: Net, firings: tuple[str, ...], place: int) -> list[int]:
@@ -350,9 +399,81 @@ def _since(net: Net, firings: tuple[str, ...], place: int) -> list[int]:
     return []
 
 
-def _held(net: Net, draft: Draft, since: list[int]) -> list[int]:
-    """Return the marked places at which the tokens are that the first firing took."""
-    return [p for p in sorted(_carried(net, since)[-1][1]) if draft.marking[p]] if since else []
+def _held(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> list[int]:
+    """Return the marked places whose tokens stand for tokens of the place that are taken; empty if
+    one was lost."""
+    if not _since(net, firings, place) or _loser(net, draft, firings, place) is not None:
+        return []
+    stands = _stands_for(net, place, _ends(draft))
+    return [p for p, n in enumerate(draft.marking) if n and p != place and stands.get(p)]
+
+
+def _loser(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> int | None:
+    """Return the last firing that lost a token of the place; None if all are still somewhere."""
+    stands = _stands_for(net, place, _ends(draft))
+    if sum(n * draft.marking[p] for p, n in stands.items()) > net.initial[place] - 0.5:
+        return None
+    for t in (net.transition_index[name] for name in reversed(firings)):
+        if sum(stands.get(p, 0.0) * c for p, c in net.compiled.changes[t]) < -0.5:
+            return t
+    return None
+
+
+@lru_cache(maxsize=64)
+def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, float]:
+    """Return for how many tokens of the place a token of each other place stands.
+
+    The net as it was meant returns what it takes: weights y >= 0 exist that every firing keeps. So
+    the y that the fewest transitions of the real net change (least sum of |y C|, a linear program)
+    show the transition that is wrong. What takes or gives tokens of the place itself is believed
+    first; what gives nothing at all, last. No place is weighed that nothing takes from, except an
+    end of the task (`ends`), and none that has tokens at the beginning, such as another resource: a
+    token that arrives there was returned.
+    """
+    from scipy.optimize import linprog
+    from scipy.sparse import csr_array
+
+    changes = net.compiled.changes
+    moved = {p for arcs in net.consume for p, _ in arcs if not net.initial[p]}
+    places = [place, *sorted((moved | ends) - {place})]
+    column = {p: i for i, p in enumerate(places)}
+    n, m = len(places), len(changes)
+    cost, entries = np.full(n + 2 * m, 1e-4), list[tuple[int, int, float]]()
+    for t, own in enumerate(changes):
+        entries += [(t, column[p], float(c)) for p, c in own if p in column]
+        entries += [(t, n + 2 * t, 1.0), (t, n + 2 * t + 1, -1.0)]
+        doubt = 100.0 if dict(own).get(place) else 1.0 if net.produce[t] else 0.9
+        cost[n + 2 * t : n + 2 * t + 2] = doubt
+    rows, columns, values = zip(*entries, strict=True)
+    equal = csr_array((values, (rows, columns)), shape=(m, n + 2 * m))
+    bounds = [(1.0, 1.0), *[(0.0, None)] * (n - 1 + 2 * m)]
+    found = linprog(cost, A_eq=equal, b_eq=np.zeros(m), bounds=bounds, method="highs")
+    weights = found.x if found.status == 0 else np.zeros(n)
+    return {p: float(weights[i]) for p, i in column.items()}
+
+
+def _ends(draft: Draft) -> frozenset[int]:
+    """Return the places at which the task gives up as designed."""
+    task, net = draft.compiled.task, draft.compiled.net
+    names = task.final_error.names if task.final_error is not None else frozenset[str]()
+    return frozenset(p for p, name in enumerate(net.places) if name in names and not net.initial[p])
+
+
+def _leading(net: Net, place: int) -> set[int]:
+    """Return the places, without tokens at the beginning, from which arcs lead to what fills the
+    place."""
+    reached = set[int]()
+    wanted = {place}
+    while wanted:
+        fill = [
+            t
+            for t, own in enumerate(net.compiled.changes)
+            if any(p in wanted and c > 0 for p, c in own)
+        ]
+        fed = {p for t in fill for p, _ in net.consume[t] if not net.initial[p] and p != place}
+        wanted = fed - reached
+        reached |= wanted
+    return reached
 
 
 def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
@@ -361,8 +482,8 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
         t for t, changes in enumerate(net.compiled.changes) if dict(changes).get(place, 0) > 0
     ]
     back = ", ".join(f"`{net.transitions[t]}`" for t in givers)
-    since = _since(net, firings, place)
-    if not since and givers:
+    since, held = _since(net, firings, place), _held(net, draft, firings, place)
+    if givers and not (since and (net.initial[place] or held)):
         order = [net.transition_index[name] for name in firings]
         return f"only {back} can fill it{_elsewhere(net, order, givers)}"
     if not since:
@@ -370,15 +491,16 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     taker = f"taken by `{net.transitions[since[0]]}`"
     if not givers:
         return f"{taker}, and no transition returns it"
-    steps = _carried(net, since)
-    held = [net.places[p] for p in _held(net, draft, since)]
-    for i, (mover, carried) in enumerate(steps):
-        # firings before this one could still lead to a giver, and later ones cannot help
-        if not _leads(net, carried, set(givers), place):
-            if i:
-                return f"{taker}, never returned by `{net.transitions[mover]}`"
+    loser = _loser(net, draft, firings, place)
+    if loser is not None:
+        if any(p == place for p, _ in net.consume[loser]):
             return f"{taker}, and nothing that follows it returns it"
-    where = f"still held with {' and '.join(held)}" if held else f"to be returned by {back}"
+        return f"{taker}, never returned by `{net.transitions[loser]}`"
+    where = (
+        f"still held with {' and '.join(net.places[p] for p in held)}"
+        if held
+        else f"to be returned by {back}"
+    )
     return f"{taker}, {where}"
 
 
@@ -395,32 +517,3 @@ def _elsewhere(net: Net, order: list[int], givers: list[int]) -> str:
         seen |= needed
         wanted = {t for t, arcs in enumerate(net.produce) if any(p in needed for p, _ in arcs)}
     return ""
-
-
-def _carried(net: Net, order: list[int]) -> list[tuple[int, set[int]]]:
-    """Follow the tokens that the first firing produced through the later firings. Return the first
-    firing and those that moved some of them, each with the places where they are after it. Places
-    that have tokens at the beginning, such as other resources, are not followed: a token that
-    arrives there was returned."""
-    given = [{p for p, _ in arcs if not net.initial[p]} for arcs in net.produce]
-    steps = [(order[0], given[order[0]])]
-    for t in order[1:]:
-        carried = steps[-1][1]
-        taken = {p for p, _ in net.consume[t]} & carried
-        if taken and taken != given[t] & taken:
-            steps.append((t, (carried - taken) | given[t]))
-    return steps
-
-
-def _leads(net: Net, places: set[int], givers: set[int], filled: int) -> bool:
-    """Return whether arcs lead from one of the places to a transition that fills the place, without
-    that place itself and, as in `_carried`, those that have tokens at the beginning."""
-    reached = set(places)
-    while True:
-        fed = {t for t, arcs in enumerate(net.consume) if reached & {p for p, _ in arcs}}
-        if fed & givers:
-            return True
-        more = {p for t in fed for p, _ in net.produce[t] if p != filled and not net.initial[p]}
-        if more <= reached:
-            return False
-        reached |= more

@@ -14,7 +14,7 @@ the beginning, so that a dead end far away is found.
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import cycle
@@ -50,6 +50,8 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.engine.step import at_end
 from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task.conditions import And, Compare, Literal, Name
+from petrobot.coordinator.task.conditions.language import Node
 
 SHOWN = 20
 """The most firings of one stimulus that are written."""
@@ -65,8 +67,11 @@ PLAYS = 4
 SHORTEST, LENGTHS = 32, 6
 """The shortest play, and the number of lengths: each is twice the one before."""
 RARE, KNOWN = 1e-6, 0.5
-"""How likely a play takes an ERROR if it is careful, as each second one is, and a state that was
-explored before. Errors often end a mission, and then nothing deeper is seen."""
+"""How likely a play takes an ERROR or what makes `final` impossible, such as a stop button, if it
+is careful, as each second one is, and a state that was explored before. These often end a mission,
+and then nothing deeper is seen."""
+LOOKS = 64
+"""So many states that a search for the nearest one looks at cost as much as a stimulus."""
 STALE = 16
 """Steps without a new state after which a play continues at the nearest new one."""
 QUEUE = 16
@@ -220,6 +225,13 @@ class ExecutionGraph:
         return np.fromiter(finished, np.bool_, len(self.states))
 
     @cached_property
+    def spoiled(self) -> Mask:
+        """States with tokens that `final` forbids and that no transition takes."""
+        never = spoiling(self.engine.compiled.task)
+        there = (any(s.marking[p] for p in never) for s in self.states)
+        return np.fromiter(there, np.bool_, len(self))
+
+    @cached_property
     def dead(self) -> Mask:
         """States that are not an end, and from which neither a firing nor an end can be reached
         without the operator."""
@@ -362,6 +374,25 @@ def with_operator(x: ExecutionGraph, *, limit: int = STEPS) -> ExecutionGraph:
     return search.with_operator(x, limit)
 
 
+def conjuncts(node: Node) -> Iterator[Node]:
+    """Yield the conditions that must all hold."""
+    if isinstance(node, And):
+        for operand in node.operands:
+            yield from conjuncts(operand)
+    else:
+        yield node
+
+
+def spoiling(task: Task) -> tuple[int, ...]:
+    """Return the places that `final` wants empty and that no transition takes from."""
+    net, empty = task.net, set[str]()
+    for node in conjuncts(task.final.tree):
+        if isinstance(node, Compare) and node.sign == "==" and node.right == Literal(0):
+            empty |= {node.left.name} if isinstance(node.left, Name) else set()
+    taken = {p for arcs in net.consume for p, _ in arcs}
+    return tuple(p for p, name in enumerate(net.places) if name in empty and p not in taken)
+
+
 @dataclass
 class _Search:
     engine: Engine
@@ -434,6 +465,14 @@ class _Search:
         edges = {i: range(rows[i], rows[i + 1]) for i in range(known)}
         random, careful = np.random.Generator(np.random.PCG64(0)), False
         lengths = cycle(SHORTEST << n for n in range(LENGTHS))
+        never = spoiling(self.engine.compiled.task)
+
+        def avoided(e: int) -> bool:
+            if not careful:
+                return False
+            before, after = (self.states[row[e]].marking for row in (source, target))
+            return self.steps[label[e]].fails or any(after[p] > before[p] for p in never)
+
         while len(edges) < len(self.states) and self.handled < limit and not self.late:
             i, stale, careful = 0, 0, not careful
             for _ in range(next(lengths)):
@@ -443,17 +482,16 @@ class _Search:
                     self._expand(i)
                     edges[i] = range(begin, len(target))
                 ways = [e for e in edges[i] if target[e] != i]
-                if stale >= STALE and all(target[e] in edges for e in ways):
+                if stale >= STALE and all(target[e] in edges or avoided(e) for e in ways):
                     # Else a part that the task never leaves would hardly be explored to its end.
-                    if (i := self._nearest(i, edges)) < 0:
+                    if (i := self._nearest(i, edges, avoided)) < 0:
                         break
                     continue
                 if not ways:
                     break
                 shares = list[float]()
                 for e in ways:
-                    avoided = careful and self.steps[label[e]].fails
-                    share = (RARE if avoided else 1.0) * (KNOWN if target[e] in edges else 1.0)
+                    share = (RARE if avoided(e) else 1.0) * (KNOWN if target[e] in edges else 1.0)
                     shares.append(share + (shares[-1] if shares else 0.0))
                 way = bisect(shares, random.random() * shares[-1], hi=len(ways) - 1)
                 i = target[ways[way]]
@@ -461,16 +499,18 @@ class _Search:
             self.late = overtime()
         return edges
 
-    def _nearest(self, i: int, edges: Mapping[int, Iterable[int]]) -> int:
-        """Return the nearest state after this one that is not explored; -1 if there is none:
-        nothing else can be reached."""
+    def _nearest(
+        self, i: int, edges: Mapping[int, Iterable[int]], avoided: Callable[[int], bool]
+    ) -> int:
+        """Return the nearest state after this one that is not explored, without edges that are
+        avoided; -1 if there is none: nothing else can be reached."""
         target, seen = self.edges[1], {i: None}
-        for state in (todo := [i]):
-            self.handled += 1
+        for n, state in enumerate(todo := [i]):
+            self.handled += n % LOOKS == 0
             for e in edges[state]:
-                if (j := target[e]) not in edges:
+                if (j := target[e]) not in edges and not avoided(e):
                     return j
-                if j not in seen:
+                if j in edges and j not in seen:
                     seen[j] = None
                     todo.append(j)
         return -1

@@ -277,8 +277,8 @@ class Progress:
         calm = x.of_edges(~x.fails & ~x.firing(self._stops))
         hopeless = f"the task can only give up: it never comes to {final}"
         only_gives_up = x.complete and not x.final.any() and tired.all()
-        good = x.final | ~x.expanded
-        lost = np.flatnonzero(~(x.graph.backward(good) | calm.backward(x.given_up)))
+        ends = calm.backward(x.given_up | ~x.expanded)
+        lost = np.flatnonzero(~(x.graph.backward(x.final | ~(x.expanded | x.spoiled)) | ends))
         if not len(lost) and only_gives_up:
             return self._no(hopeless, int(np.flatnonzero(x.given_up)[0]))
         if not len(lost):
@@ -333,7 +333,11 @@ class Progress:
         """
         x, known = self.x, self.x.engine.compiled
         awaiting = {t.name: {*t.flags, t.pulse} for t in known.transitions if t.flags or t.pulse}
-        good, can = x.final | ~x.expanded, x.graph.backward(x.final)
+        good, can = x.final | ~(x.expanded | x.spoiled), x.graph.backward(x.final)
+        if (
+            not x.complete
+        ):  # if `final` cannot be reached from the first state, the task is not sound
+            can[0] = True
         lost = ~x.graph.backward(good)
         marks, found, free = self._marks(awaiting), set[str](), (self._nominal & can)[x.source]
         for n in np.unique(x.label[free]).tolist():
