@@ -66,7 +66,8 @@ SETPOINT = (
 DIGITAL = ("standard_digital_output_mask", "standard_digital_output")
 POWER_OFF, IDLE, RUNNING = 3, 5, 7
 SAFETY = {1: "normal", 2: "reduced", 3: "protective_stop", 4: "recovery", 5: "safeguard_stop",
-          6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault"}  # fmt: skip
+          6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault", 10: "fault",
+          11: "fault", 12: "safeguard_stop", 13: "safeguard_stop"}  # fmt: skip
 MAY_MOVE = (1, 2)
 STANDING = 0.01
 """Speed below which a joint stands still (rad/s)."""
@@ -224,8 +225,10 @@ class Arm(Driver):
         else:
             ready = powered and self._wanted and now - self._echoed < STALE
         if self._enabled and not ready:
-            text = SAFETY.get(safety, "link_lost") if safety not in MAY_MOVE else ""
-            self._lose(text or ("program_lost" if powered else "power_off"))
+            text = "program_lost" if powered else "power_off"
+            if safety not in MAY_MOVE:
+                text = SAFETY.get(safety, "fault") if fresh else "link_lost"
+            self._lose(text)
         elif ready and not self._enabled:
             self._enabled, self._reason = True, ""
             self._motion.halt(data["actual_q"])

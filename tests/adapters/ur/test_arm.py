@@ -222,6 +222,8 @@ def test_wrong_keys(keys: dict[str, Any], says: str) -> None:
     [
         (UrController.protective_stop, "protective_stop"),
         (UrController.emergency_stop, "emergency_stop"),
+        (lambda c: setattr(c, "safety_mode", 13), "safeguard_stop"),  # the enabling device
+        (lambda c: setattr(c, "safety_mode", 99), "fault"),  # of a later version
         (lambda c: setattr(c, "program", ""), "program_lost"),
         (lambda c: setattr(c, "robot_mode", 5), "power_off"),
     ],
@@ -238,7 +240,7 @@ def test_a_stop_of_the_controller_is_a_fault_until_it_is_enabled_again(
     at = list(cell.controller.q)
     cell.run(2.0)
     assert cell.controller.q == pytest.approx(at, abs=1e-6) and cell.arm.stopped()
-    if fault == "emergency_stop":
+    if fault in ("emergency_stop", "safeguard_stop", "fault"):
         cell.controller.safety_mode = NORMAL  # the mushroom button is turned back
     assert cell.enabled().go(joints=THERE)
 
