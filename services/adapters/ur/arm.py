@@ -140,7 +140,9 @@ class Arm(Driver):
             self, self._arm.limits, self.top_speed, self.acceleration, self._arm.point
         )
         self._seen = self._echoed = -math.inf
-        self._count, self._echo, self._beat, self._ask_at = 0, -1, 0, 0.0
+        self._count, self._beat, self._ask_at = 0, 0, 0.0
+        self._echo: int | None = None
+        """What the program has last echoed; None before the first data of a connection."""
         self._measured: Sequence[float] = (0.0,) * 6
         """Joint angles last received (rad), also without a connection."""
         self._wanted = self._enabled = self._quick = False
@@ -200,7 +202,7 @@ class Arm(Driver):
         data = self._link.receive(now)
         if self._link.count != self._connection:
             self._connection = self._link.count
-            self._rtde, self._count = Rtde(OUTPUTS, (SETPOINT, DIGITAL)), 0
+            self._rtde, self._count, self._echo = Rtde(OUTPUTS, (SETPOINT, DIGITAL)), 0, None
         try:
             self._rtde.receive(data)
         except RtdeError as fault:
@@ -209,7 +211,7 @@ class Arm(Driver):
             self._count, self._seen = self._rtde.count, now
             self._measured = self._rtde.data["actual_q"]
             echo = self._rtde.data["output_int_register_24"]
-            if echo != self._echo and 0 <= self._beat - echo < 100 and self._count > 1:
+            if self._echo not in (None, echo) and 0 <= self._beat - echo < 100:
                 self._echoed = now  # the program has read the set point sent just before
             self._echo = echo
         for other in (self._dashboard, self._program):

@@ -128,6 +128,18 @@ def test_nothing_moves_before_it_is_enabled() -> None:
     assert not cell.controller.program and cell.controller.robot_mode != RUNNING
 
 
+def test_data_that_arrive_together_are_no_echo_of_the_program() -> None:
+    """As of a controller that sends more often, or on a busy computer."""
+    cell = Cell()
+    cell.controller.robot_mode = RUNNING
+    cell.arm.command(cell.now, ENABLE)
+    for _ in range(20):
+        cell.now += 5 * cell.arm.period
+        cell.arm.step(cell.now)
+        assert bool(cell.controller.program) or not cell.arm.state()["ready"]
+    assert not cell.arm.state()["faults"]
+
+
 def test_why_it_is_not_enabled_yet_is_said() -> None:
     cell = Cell()
     cell.arm.command(cell.now, ENABLE)
