@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -47,6 +48,7 @@ class CameraDriver(Driver):
         import cv2  # not needed by nodes without a camera
 
         self._source = ports.images()
+        self._colour = bool(config.get("colour", False))
         self._newest: Image | None = None
         self._last: Image | None = None
         self._count = 0
@@ -100,23 +102,13 @@ class CameraDriver(Driver):
 
     async def read(self, ctx: Context[Any], timeout: float) -> Image | None:
         """Return the newest image that was not read yet, None when none arrives for `timeout` s.
-        Raises CameraError for an image of another size, or one whose pixels are not bytes."""
+        Raises CameraError for an image of another size, or one that is not as `Image` says."""
         await ctx.wait(self._arrived, timeout)
         image, self._newest = self._newest, None
         if image is None:
             return None
-        kind = str(getattr(image.pixels, "dtype", type(image.pixels).__name__))
-        if kind != "uint8":
-            raise CameraError(
-                f"camera: expected pixels of type uint8, found {kind}: convert them in "
-                f"{self.source}"
-            )
-        if self.shape and image.pixels.shape != self.shape:
-            raise CameraError(
-                f"camera: expected images of {_size(self.shape)}, found "
-                f"{_size(image.pixels.shape)}; change {self.shaped_by or 'the driver'}, or the "
-                "camera's settings"
-            )
+        if fault := self._unusable(image):
+            raise CameraError(f"camera: expected {fault}")
         self._count += 1
         self._last = image
         return image
@@ -126,8 +118,30 @@ class CameraDriver(Driver):
         return f"{text}: {self._source.condition}" if self._source.condition else text
 
     def _arrived(self) -> bool:
-        self._newest = self._source.newest() or self._newest
+        newest = self._source.newest()
+        self._newest = self._newest if newest is None else newest
         return self._newest is not None
+
+    def _unusable(self, image: Any) -> str:
+        """Return what was expected of an image, and found; empty for one that can be used. A class
+        of the user's may return anything."""
+        missing = [name for name in ("pixels", "time", "sequence") if not hasattr(image, name)]
+        if missing:
+            found = f"{type(image).__name__} without {missing[0]}"
+            return f"a petrobot.Image, found {found}: correct it in {self.source}"
+        kind = str(getattr(image.pixels, "dtype", type(image.pixels).__name__))
+        if kind != "uint8":
+            return f"pixels of type uint8, found {kind}: convert them in {self.source}"
+        shape = image.pixels.shape
+        if self.shape and shape != self.shape:
+            remedy = f"change {self.shaped_by or 'the driver'}, or the camera's settings"
+            return f"images of {_size(self.shape)}, found {_size(shape)}; {remedy}"
+        if len(shape) < 2 or shape[2:] != ((3,) if self._colour else ()) or 0 in shape:
+            wanted = "width, 3)" if self._colour else "width), as without colour = true"
+            return f"pixels of shape (height, {wanted}, found {shape}: correct it in {self.source}"
+        if not isinstance(image.time, int | float) or not math.isfinite(image.time):
+            return f"a time in seconds, found {image.time!r:.40}: correct it in {self.source}"
+        return ""
 
     # For the node and the operator
 

@@ -37,6 +37,8 @@ REST, PART = 20, 0.25
 which it is stopped or held."""
 PLAY = 0.01
 """Share of its movement by which a position may change at rest: noise, and the end of settling."""
+CREEP = 1e-4
+"""Least share of its movement by which a position drifts in a quarter of a check at rest."""
 SLOWEST, NOISE = 0.05, 5.0
 """A position counts as moving while it changes by more than this share of its fastest step, and by
 more than this multiple of its change at rest."""
@@ -57,6 +59,8 @@ LONGEST_ROW = 32
 """Most numbers of a list that tell where the device is: a longer one is a scan or a history."""
 LARGEST_STATE = 100_000
 """Most items and characters of a state: it is sent after each step."""
+UNIT = 0.2
+"""Greatest ratio of two units: above it, a position short of its goal was clamped."""
 JUMP = 3.0
 """Multiple of its fastest step by which a position may change at once."""
 MEASURED = (
@@ -241,6 +245,8 @@ class _Check:
         """Why it refused the last command."""
         self.fastest: dict[str, float] = {}
         """The largest step of each position in the last movement."""
+        self.start: dict[str, float] = {}
+        """The positions at the beginning of the last `way`."""
 
     def fault(self, text: str) -> None:
         if text not in self.found.faults:
@@ -398,7 +404,7 @@ class _Check:
             return
         far = {n: begin[n] - v for n, v in self.numbers().items() if n in positions.keys() & begin}
         fastest = self.fastest
-        self.arrived(there, positions, seconds)
+        self.arrived(there, back, positions, seconds)
 
         def begun() -> None:
             self.move(there, seconds, judged=False)
@@ -441,9 +447,14 @@ class _Check:
             self.stands(f"after {dict(there)}")
             self.note(f"stop and hold during {dict(there)}: it changes the state at once")
 
-    def arrived(self, there: Command, positions: Mapping[str, float], seconds: float) -> None:
-        """Judge whether the device stands at the end of a movement. Raises _TooLongError."""
+    def arrived(
+        self, there: Command, back: Command, positions: Mapping[str, float], seconds: float
+    ) -> None:
+        """Judge whether the device stands at the end of a `way`, and where. Raises
+        _TooLongError."""
         moving = self.run(self.within, self.stopped, positions)
+        if self.stopped() or not moving:
+            self.clamped((there, self.numbers()), (back, self.start), positions)
         if self.stopped():
             self.stands(f"after {dict(there)}", positions)
         else:  # it may be one that runs until it is stopped, as a pump
@@ -455,6 +466,43 @@ class _Check:
                 text = f"stopped() is still False after {self.within:g} s"
                 self.fault(f"after {dict(there)}: {text}")
 
+    def clamped(
+        self,
+        there: tuple[Command, dict[str, float]],
+        back: tuple[Command, dict[str, float]],
+        positions: Mapping[str, float],
+    ) -> None:
+        """Judge whether the device is where two commands say, from both and the positions at their
+        ends.
+
+        Nothing says which number of a command is the goal of which position. One at which a
+        position is after one of the commands is taken for its goal; then it must be at that of the
+        other one too, or have moved by it.
+        """
+        asked = [_leaves(command) for command, _ in (there, back)]
+        misses = dict[tuple[str, str], list[float]]()
+        """By position and path in the commands: how far it is from both, as shares of its way."""
+        for name in positions:
+            first, last = (end.get(name, math.nan) for _, end in (back, there))
+            way = last - first
+            for path, to in asked[0].items() if abs(way) > PART * positions[name] else ():
+                fro = asked[1].get(path, math.nan)
+                if _tells(to) and _tells(fro) and to != fro:
+                    moved = max(abs(way - to), abs(way + fro)) <= PLAY * abs(way)
+                    off = [abs(last - to) / abs(way), abs(first - fro) / abs(way)]
+                    misses[name, path] = [0.0] if moved else off
+        known = {part for pair, off in misses.items() if max(off) <= PLAY for part in pair}
+        for (name, path), off in misses.items():
+            if known.isdisjoint((name, path)) and min(off) <= PLAY and max(off) > SLOWEST:
+                wrong = int(off[0] <= PLAY)
+                command, end = (there, back)[wrong]
+                if not asked[1 - wrong][path] and not UNIT < end[name] / asked[wrong][path] < 1.0:
+                    continue  # 0 is 0 in any unit
+                self.fault(
+                    f"{dict(command)}: accepted, and {name} ended at {end[name]:g}; obey {path}, "
+                    "or raise ValueError (if something was in its way, give another command)"
+                )
+
     def holds(self, positions: Mapping[str, float]) -> bool:
         """Hold during a movement. Return whether the driver answered that it is held."""
         answer = self.ask(self.driver.hold, self.now())
@@ -462,7 +510,7 @@ class _Check:
             self.fault(f'hold: expected "held", "cannot hold" or "stopped", got {answer!r}')
         if answer in ("held", "stopped"):
             self.run(self.within)
-            if drift := self.run(max(self.within, REST * self.period), positions=positions):
+            if drift := self.drifts(positions):
                 self.fault(f"hold: answered {answer!r}, and {_names(drift)} still changes")
         return bool(answer == "held")
 
@@ -589,7 +637,7 @@ class _Check:
     ) -> tuple[Mapping[str, float], float]:
         """Move back and there; return how far each position came, and how long it took (s)."""
         self.move(back, seconds, judged=False)  # it may already be there, and only settle
-        begin = self.now()
+        self.start, begin = self.numbers(), self.now()
         positions = self.move(there, seconds)
         return positions, max(self.period, self.now() - begin - REST * self.period)
 
@@ -675,8 +723,23 @@ class _Check:
         self.run(self.within, self.stopped)
         if not self.stopped():
             self.fault(f"{what}: stopped() is still False after {self.within:g} s")
-        elif drift := self.run(max(self.within, REST * self.period), positions=positions):
+        elif drift := self.drifts(positions or {}):
             self.fault(f"{what}: stopped() is True, and {_names(drift)} still changes")
+
+    def drifts(self, positions: Mapping[str, float]) -> set[str]:
+        """Step for a while; return the positions that change by more than at rest, or slowly and
+        steadily: what only settles becomes slower."""
+        points, end = [self.numbers()], self.now() + max(self.within, REST * self.period)
+        while self.now() < end:
+            points.append(self.step())
+        drifted = {n for point in points for n in _differ(points[0], point, positions, PLAY)}
+        for name in positions:
+            places = [point[name] for point in points[:: len(points) // 4] if name in point]
+            ways = sorted((after - before for before, after in pairwise(places)), key=abs)
+            least = max(CREEP * positions[name], self.idle.get(name, 0.0))
+            if len(ways) > 3 and all(way / ways[-1] > 0.5 for way in ways if abs(way) > least):
+                drifted |= {name} if abs(ways[0]) > least else set()
+        return drifted
 
     def stopped(self) -> bool:
         return bool(self.ask(self.driver.stopped))

@@ -25,7 +25,7 @@ class Source:
         self.shape: tuple[int, ...] = SHAPE
         self.condition, self.rates, self.count = "", list[float](), 0
         self.kind: Any = np.uint8
-        self.times: Iterator[float] = repeat(0.5)
+        self.times: Iterator[Any] = repeat(0.5)
 
     def start(self, rate: float) -> None:
         if self.condition:
@@ -94,6 +94,8 @@ def test_an_image_exposed_before_is_not_taken() -> None:
         ({"shape": (48, 64, 3)}, "expected images of 64x48, found 64x48x3"),
         ({"kind": np.uint16}, "expected pixels of type uint8, found uint16: convert them in sim"),
         ({"kind": None}, "expected pixels of type uint8, found NoneType"),
+        ({"times": repeat(None)}, "expected a time in seconds, found None: correct it in sim"),
+        ({"times": repeat(float("nan"))}, "expected a time in seconds, found nan"),
         ({"condition": "camera 'x' was lost"}, "was lost"),
     ],
 )
@@ -106,7 +108,31 @@ def test_what_is_wrong_with_the_images_is_said(trouble: dict[str, Any], text: st
     assert found.cause == "no_image" and text in found.text, found
     assert camera.stopped() and (not source.rates or source.rates[-1] == 0.0)
     source.shape, source.condition, source.kind = SHAPE, "", np.uint8
+    source.times = repeat(0.5)
     assert rehearse(look, device=camera).result.status == "success"
+
+
+@pytest.mark.parametrize(
+    ("shape", "colour"),
+    [((48, 64, 3), False), ((48, 64), True), ((48, 64, 4), True), ((64,), False), ((0, 0), False)],
+)
+def test_images_are_grey_or_coloured_as_the_table_says(
+    shape: tuple[int, ...], colour: bool
+) -> None:
+    """Also those of a user's class, without a driver that knows their size."""
+    source = Source()
+    camera = eye(source, colour=colour)
+    camera.shape, source.shape = (), shape
+    text = rehearse(look, device=camera).result.text
+    assert text.startswith("camera: expected pixels of shape (height, width"), text
+    assert f"found {shape}: correct it in sim" in text
+
+
+def test_a_source_that_gives_something_else_than_images_is_named() -> None:
+    source = Source()
+    source.newest = lambda: cast(Image, np.zeros(SHAPE, np.uint8))  # type: ignore[method-assign]
+    text = rehearse(look, device=eye(source)).result.text
+    assert "expected a petrobot.Image, found ndarray without pixels: correct it in sim" in text
 
 
 def test_why_images_are_missing_is_said() -> None:
@@ -136,7 +162,7 @@ def test_an_impossible_rate_is_refused(rate: float) -> None:
 
 def test_the_operator_sees_the_last_image() -> None:
     source = Source()
-    camera = eye(source)
+    camera = eye(source, colour=True)
     camera.shape = ()
     source.shape = (48, 64, 3)
     assert camera.picture() == {}

@@ -316,6 +316,22 @@ class Creeps(Axis):
         self.at -= 0.00005 if self.paused else 0.0
 
 
+class Sags(Axis):
+    """While it is held, it moves at a hundredth of its speed: too slow to be seen at once."""
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        self.at += 0.00001 * self.paused
+
+
+class Clamps(Axis):
+    """Goes at most to 0.15 m, and does not say so."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        self.goal = min(0.15, self.goal)
+
+
 class CatchesUp(Axis):
     """After a hold it is where it would have been without."""
 
@@ -442,6 +458,8 @@ class DrawsByItself(Axis):
         (WaitsInStop, "stop: "),
         (IgnoresCommands, "{'to': 0.2}: accepted during {'to': 0.0}, and axis[0].at moved on"),
         (Creeps, "hold: answered 'held', and axis[0].at still changes"),
+        (Sags, "hold: answered 'held', and axis[0].at still changes"),
+        (Clamps, "{'to': 0.2}: accepted, and axis[0].at ended at 0.15; obey to, or raise"),
         (CatchesUp, "release: axis[0].at jumps instead of moving on"),
         (GoesOnAfterAStop, "release: the movement that was held and then stopped continues"),
         (Grows, "state: moves grows all the time"),
@@ -555,6 +573,20 @@ class RefusesWhileItMoves(Axis):
         super().command(now, body)
 
 
+class Turntable(Axis):
+    """Commanded in other units than those of its state; it settles slowly."""
+
+    def step(self, now: float) -> None:
+        way = 0.1 * (self.goal - self.at)
+        self.at += 0.0 if self.paused or abs(way) < 1e-9 else way
+
+    def state(self) -> Mapping[str, Any]:
+        return {"degrees": math.degrees(self.at), "cosine": math.cos(self.at)}
+
+    def stopped(self) -> bool:
+        return self.paused or abs(self.goal - self.at) < 1e-4
+
+
 class Remembers(Axis):
     """Its state has its last 200 positions."""
 
@@ -585,7 +617,7 @@ def test_a_movement_that_is_slow_is_not_the_drivers_fault(
 @pytest.mark.parametrize(
     ("kind", "notes"),
     [(Pump, "it moves nothing after"), (Outputs, "it changes the state at once"),
-     (RefusesWhileItMoves, ""), (Remembers, "")],
+     (RefusesWhileItMoves, ""), (Remembers, ""), (Turntable, "")],
 )  # fmt: skip
 def test_unusual_drivers_that_keep_the_rules_pass(kind: type[Axis], notes: str) -> None:
     found = checked(kind)

@@ -206,10 +206,9 @@ class OpcUaSession(Driver):
         for name, text in self.nodes.items():
             try:
                 node = await _node(client, text)
-                kind = await _kind(node)
-                heard.names[node.nodeid] = name
+                nodes[name] = node, await _kind(node)
+                heard.names.setdefault(node.nodeid, []).append(name)
                 await subscription.subscribe_data_change(node)
-                nodes[name] = node, kind
             except (ua.UaError, ValueError) as fault:
                 faults[name] = f"{text}: {fault}"
         session.opened(faults)
@@ -240,14 +239,18 @@ async def _node(client: Any, text: str) -> Any:
 
 
 async def _kind(node: Any) -> Any:
-    """Return the type of a node's values; for an abstract one, such as Number, that of the present
-    value."""
+    """Return the type of a node's values; for one that is abstract, such as Number, or unknown,
+    that of the present value. None if there is none, as while a PLC starts. Raises UaError if there
+    is no such node."""
     from asyncua import ua
 
-    kind = await node.read_data_type_as_variant_type()
-    if kind is ua.VariantType.Variant:
-        kind = (await node.read_data_value()).Value.VariantType
-    return kind
+    await node.read_attribute(ua.AttributeIds.DataType)
+    with contextlib.suppress(ua.UaError):
+        kind = await node.read_data_type_as_variant_type()
+        if kind is not ua.VariantType.Variant:
+            return kind
+    found = (await node.read_data_value(raise_on_bad_status=False)).Value
+    return None if found is None or found.Value is None else found.VariantType
 
 
 class _Notifications:
@@ -255,7 +258,7 @@ class _Notifications:
 
     def __init__(self, session: SessionThread, largest: int) -> None:
         """`largest`: characters of the largest value that is kept."""
-        self.names: dict[Any, str] = {}
+        self.names: dict[Any, list[str]] = {}
         self._largest = largest
         self._session, self._beat = session, time.monotonic()
 
@@ -267,17 +270,18 @@ class _Notifications:
         """Take a new value."""
         self._beat = time.monotonic()
         status = data.monitored_item.Value.StatusCode
-        if node.nodeid not in self.names:
-            return  # the heartbeat
-        name = self.names[node.nodeid]
+        plain, fault = _plain(value), ""
         if status is not None and status.is_bad():
-            self._session.tell("bad", (name, status.name))
+            fault = status.name
         elif value is None:
-            self._session.tell("bad", (name, "it has no value"))
-        elif len(str(plain := _plain(value))) > self._largest:
-            self._session.tell("bad", (name, f"it is longer than {self._largest} characters"))
-        else:
-            self._session.tell("value", (name, plain))
+            fault = "it has no value"
+        elif len(str(plain)) > self._largest:
+            fault = f"it is longer than {self._largest} characters"
+        elif _is_nan(plain):
+            fault = "it is not a number (NaN)"
+        for name in self.names.get(node.nodeid, ()):  # none: the heartbeat
+            item = ("bad", (name, fault)) if fault else ("value", (name, plain))
+            self._session.tell(*item)
 
 
 async def _written(
@@ -294,6 +298,9 @@ async def _written(
         if name not in nodes:
             return f"{name}: {faults[name]}"
         node, kind = nodes[name]
+        kind = kind or await _kind(node)
+        if kind is None:
+            return f"{name}: its type is unknown, since it has no value yet"
         items = value if isinstance(value, list) else [value]
         try:
             # As a Boolean, any text would be encoded as True.
@@ -321,6 +328,11 @@ async def _changed(node: Any, kind: Any) -> str:
     except ua.UaStatusCodeError:  # it is gone
         same = False
     return "" if same else f"; {CHANGED}"
+
+
+def _is_nan(value: Any) -> bool:
+    """Whether a value is, or contains, NaN: nothing that compares it would notice."""
+    return any(map(_is_nan, value)) if isinstance(value, list) else bool(value != value)
 
 
 def _plain(value: Any) -> Any:

@@ -90,6 +90,8 @@ class OfferedTask:
         if message["op"] == "cancel_action_goal" and goal == self._goal:
             self._why = "cancelled"
         elif message["op"] == "send_action_goal" and isinstance(goal, str) and goal:
+            if goal == self._goal:
+                return  # sent twice: an answer would end the goal, while its run continues
             if self._goal:
                 self._result(goal, ABORTED, "refused", "a run of this task is active")
                 return

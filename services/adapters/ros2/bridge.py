@@ -61,14 +61,14 @@ class Fragments:
     """Puts messages together that a server sends in parts (operation `fragment`)."""
 
     def __init__(self) -> None:
-        self._parts: dict[str, dict[int, str]] = {}
+        self._parts: dict[str, dict[float, str]] = {}
 
     def add(self, part: Message) -> Message | None:
         """Return the message that a part completes, None if parts are missing. Raises
         ValueError."""
         match part:
-            case {"num": int(number), "total": int(total), "data": str(data)} if (
-                0 <= number < total <= MOST_FRAGMENTS
+            case {"num": int() | float() as number, "total": total, "data": str(data)} if (
+                isinstance(total, int | float) and 0 <= number < total <= MOST_FRAGMENTS
             ):
                 name = str(part.get("id"))
             case _:
@@ -182,7 +182,7 @@ class Exchange:
         """Store feedback; return why it cannot be used."""
         if self.phase is ExchangePhase.PENDING:
             self.phase = ExchangePhase.ACTIVE
-        if fault := unfit(values):
+        if fault := unfit(values, gaps=True):
             return f"feedback: {fault}"
         self.feedback, self.count = values, self.count + 1
         return ""
@@ -305,7 +305,7 @@ class Exchanges:
             status = None
         elif status is None and isinstance(said, dict) and set(said) == {"status", "result"}:
             status, said = said["status"], said["result"]  # an older rosbridge
-        if failed or (message.get("result") is False and status not in (5, 6)):
+        if failed or (not message.get("result", True) and status not in (5, 6)):
             one.take_refusal(message.get("msg") if failed else said)
         else:
             one.take_result(said, status)

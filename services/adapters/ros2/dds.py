@@ -6,6 +6,7 @@ DDS cannot write the request ids of services and actions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -83,11 +84,13 @@ class Types:
 
 
 def plain(sample: Any) -> Any:
-    """Return a message of DDS as plain data."""
+    """Return a message of DDS as plain data, as rosbridge does: null for NaN and infinity."""
     if is_dataclass(sample):
         names = [each.name for each in fields(sample)]
         return {name: plain(getattr(sample, name)) for name in names if name != EMPTY}
-    return [plain(item) for item in sample] if isinstance(sample, list | tuple) else sample
+    if isinstance(sample, list | tuple):
+        return [plain(item) for item in sample]
+    return None if isinstance(sample, float) and not math.isfinite(sample) else sample
 
 
 class Topics(TopicDriver):

@@ -22,11 +22,12 @@ cycle."""
 # --- values and paths ---------------------------------------------------------------------------
 
 
-def unfit(values: Any, most: int = LARGEST_VALUE) -> str:
+def unfit(values: Any, most: int = LARGEST_VALUE, gaps: bool = False) -> str:
     """Return what is wrong with the values of a message, "" if they are finite, not longer than
     `most` characters and can be sent on.
 
-    ROS messages have no null: rosbridge writes it for NaN and infinity.
+    ROS messages have no null: rosbridge writes it for NaN and infinity. With `gaps` a message may
+    have it: sensors report so what they do not measure, as the temperature of a battery.
     """
     if not isinstance(values, dict):
         return f"expected a message, found {str(values)[:60]!r}"
@@ -35,7 +36,7 @@ def unfit(values: Any, most: int = LARGEST_VALUE) -> str:
         tables += isinstance(value, dict | list)
         if count > ITEMS or tables > TABLES:
             return f"has more than {ITEMS} items, or {TABLES} lists and tables"
-        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        if (value is None and not gaps) or (isinstance(value, float) and not math.isfinite(value)):
             return f"{path}: is not a finite number"
         if isinstance(value, int) and not -(2**63) <= value < 2**64:
             return f"{path}: {str(value)[:30]} does not fit into 64 bits"
@@ -61,7 +62,8 @@ def _items(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
 
 
 def pick(values: Any, path: str) -> Any:
-    """Return the value at a path such as "pose.position.x" or "points.0". Raises ValueError."""
+    """Return the value at a path such as "pose.position.x" or "points.0". Raises ValueError, also
+    for null."""
     found = values
     for name in path.split("."):
         try:
@@ -69,6 +71,8 @@ def pick(values: Any, path: str) -> Any:
         except (KeyError, IndexError, TypeError, ValueError):
             has = list(found)[:12] if isinstance(found, dict) else f"a {type(found).__name__}"
             raise ValueError(f"{path}: there is no {name!r}, but {has}") from None
+    if found is None:
+        raise ValueError(f"{path}: is not a finite number")
     return found
 
 

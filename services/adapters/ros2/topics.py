@@ -167,7 +167,7 @@ class TopicDriver(Driver):
     def arrive(self, now: float, topic: Any, message: Any) -> None:
         """Process a message of a topic."""
         most = min(messages.LARGEST_VALUE, TOPICS // max(1, len(self.subscribe)))
-        if fault := unfit(message, most):
+        if fault := unfit(message, most, gaps=True):
             self.refuse(f"{topic}: {fault}")
             return
         for name, sub in self.subscribe.items():

@@ -66,7 +66,8 @@ SETPOINT = (
 DIGITAL = ("standard_digital_output_mask", "standard_digital_output")
 POWER_OFF, IDLE, RUNNING = 3, 5, 7
 SAFETY = {1: "normal", 2: "reduced", 3: "protective_stop", 4: "recovery", 5: "safeguard_stop",
-          6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault"}  # fmt: skip
+          6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault", 10: "fault",
+          11: "fault", 12: "safeguard_stop", 13: "safeguard_stop"}  # fmt: skip
 MAY_MOVE = (1, 2)
 STANDING = 0.01
 """Speed below which a joint stands still (rad/s)."""
@@ -139,7 +140,9 @@ class Arm(Driver):
             self, self._arm.limits, self.top_speed, self.acceleration, self._arm.point
         )
         self._seen = self._echoed = -math.inf
-        self._count, self._echo, self._beat, self._ask_at = 0, -1, 0, 0.0
+        self._count, self._beat, self._ask_at = 0, 0, 0.0
+        self._echo: int | None = None
+        """What the program has last echoed; None before the first data of a connection."""
         self._measured: Sequence[float] = (0.0,) * 6
         """Joint angles last received (rad), also without a connection."""
         self._wanted = self._enabled = self._quick = False
@@ -199,7 +202,7 @@ class Arm(Driver):
         data = self._link.receive(now)
         if self._link.count != self._connection:
             self._connection = self._link.count
-            self._rtde, self._count = Rtde(OUTPUTS, (SETPOINT, DIGITAL)), 0
+            self._rtde, self._count, self._echo = Rtde(OUTPUTS, (SETPOINT, DIGITAL)), 0, None
         try:
             self._rtde.receive(data)
         except RtdeError as fault:
@@ -208,7 +211,7 @@ class Arm(Driver):
             self._count, self._seen = self._rtde.count, now
             self._measured = self._rtde.data["actual_q"]
             echo = self._rtde.data["output_int_register_24"]
-            if echo != self._echo and 0 <= self._beat - echo < 100 and self._count > 1:
+            if self._echo not in (None, echo) and 0 <= self._beat - echo < 100:
                 self._echoed = now  # the program has read the set point sent just before
             self._echo = echo
         for other in (self._dashboard, self._program):
@@ -224,8 +227,10 @@ class Arm(Driver):
         else:
             ready = powered and self._wanted and now - self._echoed < STALE
         if self._enabled and not ready:
-            text = SAFETY.get(safety, "link_lost") if safety not in MAY_MOVE else ""
-            self._lose(text or ("program_lost" if powered else "power_off"))
+            text = "program_lost" if powered else "power_off"
+            if safety not in MAY_MOVE:
+                text = SAFETY.get(safety, "fault") if fresh else "link_lost"
+            self._lose(text)
         elif ready and not self._enabled:
             self._enabled, self._reason = True, ""
             self._motion.halt(data["actual_q"])

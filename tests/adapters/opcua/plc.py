@@ -3,7 +3,8 @@
 The node `manner` decides how `request` is acknowledged: "good", "silent", "stuck" (never
 withdrawn), "blind" (it has a bad status once the request is withdrawn). Other values let something
 happen once: "retyped" (`count` becomes a text node), "forgotten" (all subscriptions are deleted),
-"bad" (`speed` has a bad status), "gone" (`count` is deleted).
+"bad" (`speed` has a bad status), "gone" (`count` is deleted), "begun" (`early` has a value, which
+it has not at the start).
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ async def trouble(server: Server, nodes: dict[str, Any], manner: str) -> None:
     if manner == "forgotten":
         service = server.iserver.subscription_service
         await service.delete_subscriptions(list(service.subscriptions))
+    elif manner == "begun":
+        await nodes["early"].write_value(3, ua.VariantType.Int16)
     elif manner in ("bad", "blind"):
         name, value = ("speed", 1.5) if manner == "bad" else ("done", True)
         status = ua.StatusCode(ua.StatusCodes.BadSensorFailure)
@@ -82,6 +85,16 @@ async def serve(port: str, *security: str) -> None:
         node = await server.nodes.objects.add_variable(identifier, name, value, kind, declared)
         await node.set_writable()
         nodes[name] = node
+    nodes["early"] = await server.nodes.objects.add_variable(
+        ua.NodeId("Cell.early", space), "early", 0, ua.VariantType.Int16, ABSTRACT["level"]
+    )
+    await nodes["early"].set_writable()
+    waits = ua.StatusCode(ua.StatusCodes.BadWaitingForInitialData)
+    await nodes["early"].write_attribute(ua.AttributeIds.Value, ua.DataValue(StatusCode=waits))
+    foreign = ua.NodeId("NoSuchType", space)
+    await server.nodes.objects.add_variable(
+        ua.NodeId("Cell.foreign", space), "foreign", 7, ua.VariantType.Int32, foreign
+    )
     async with server:
         print("ready", flush=True)
         served = False
@@ -92,7 +105,7 @@ async def serve(port: str, *security: str) -> None:
                 served = bool(request)
             elif manner == "blind" and served:
                 await trouble(server, nodes, manner)
-            if manner in ("retyped", "gone", "forgotten", "bad"):
+            if manner in ("retyped", "gone", "forgotten", "bad", "begun"):
                 await nodes["manner"].write_value("good")
                 await trouble(server, nodes, manner)
             await asyncio.sleep(0.02)

@@ -257,7 +257,7 @@ def test_values_of_any_type_are_plain(cell: Cell) -> None:
     """A list of dates would make the state one that cannot be published, and break the driver."""
     driver = cell.driver()
     heard = _Notifications(driver._session, 1000)
-    heard.names["node"] = "count"
+    heard.names["node"] = ["count"]
     dates = [datetime.datetime(2026, 11, 23), [datetime.datetime(2026, 11, 24)], 3]
     item = SimpleNamespace(Value=SimpleNamespace(StatusCode=None))
     data = SimpleNamespace(monitored_item=item)
@@ -274,6 +274,36 @@ def test_values_of_any_type_are_plain(cell: Cell) -> None:
     heard.datachange_notification(SimpleNamespace(nodeid="node"), "x" * 1001, data)
     driver.step(0.0)
     assert "longer than 1000" in driver.state()["faults"]["count"] and not driver.state()["values"]
+    heard.datachange_notification(SimpleNamespace(nodeid="node"), [1.0, float("nan")], data)
+    driver.step(0.0)
+    assert "NaN" in driver.state()["faults"]["count"] and not driver.state()["values"]
+
+
+@pytest.mark.processes
+def test_a_node_without_a_value_or_a_known_type_at_first(cell: Cell) -> None:
+    """As while a PLC starts, and on a server that does not show its own data types."""
+    cell.power(True)
+    nodes = {name: f"ns=2;s=Cell.{name}" for name in ("manner", "early", "foreign")}
+    driver = cell.driver(nodes=nodes)
+    state = await_(driver, lambda state: "foreign" in state["values"], "the first values")
+    assert state["values"]["foreign"] == 7
+    assert "WaitingForInitialData" in state["faults"]["early"]
+    assert "early: its type is unknown" in done(driver, {"early": 4})
+    assert done(driver, {"manner": "begun"}) == ""
+    state = await_(driver, lambda state: state["values"].get("early") == 3, "the value")
+    assert state["faults"] == {} and done(driver, {"early": 4}) == ""
+
+
+@pytest.mark.processes
+def test_two_names_of_one_node(cell: Cell) -> None:
+    cell.power(True)
+    nodes = {"part": NODES["sensor"], "stop": NODES["sensor"]}
+    events = {name: {"node": name, "becomes": True} for name in nodes}
+    driver = cell.driver(nodes=nodes, events=events)
+    await_(driver, lambda state: len(state["values"]) == 2, "both values")
+    assert done(driver, {"part": True}) == ""
+    await_(driver, lambda state: [*state["values"].values()] == [True, True], "both changes")
+    assert sorted(name for name, _ in cell.desk.events) == ["part", "stop"]
 
 
 @pytest.mark.processes

@@ -352,15 +352,27 @@ def test_topics_are_values_that_an_action_waits_for() -> None:
     assert "names ['battery']" in unknown.result.text
 
 
-@pytest.mark.parametrize(
-    "bad", [{"x": None}, [], None, {"x": 2**80}, {"x": "y" * 70_000}, {"\ud800": 1}]
-)
+@pytest.mark.parametrize("bad", [[], None, {"x": 2**80}, {"x": "y" * 70_000}, {"\ud800": 1}])
 def test_a_topic_message_that_cannot_be_used_is_refused(bad: Any) -> None:
     bridge, _ = wired(Ports(), subscribe={"b": BUTTON})
     shown(bridge, {"data": 1}, bad)
     state = bridge.state()
     assert state["refused"] == 1 and state["fault"].startswith("/button: ")
     assert state["topics"]["b"]["msg"] == {"data": 1}
+
+
+def test_a_topic_message_may_have_numbers_that_are_not_finite() -> None:
+    """As that of a battery that does not measure its temperature; rosbridge writes null."""
+    low = {"event": "low", "when": {"charge": [0.0, 0.2]}}
+    hot = {"event": "hot", "when": {"cells.1": [60.0, 99.0]}}
+    bridge, _ = wired(ports := Ports(), subscribe={"a": {**BUTTON, **low}, "b": {**BUTTON, **hot}})
+    shown(bridge, message := {"charge": 0.1, "cells": [3.9, None]})
+    assert bridge.state()["topics"]["b"]["msg"] == message and not bridge.state()["refused"]
+    assert [name for name, _ in ports.events] == ["low"]
+    found = rehearse(actions.wait_for, device=bridge, topic="a", values={"charge": "charge"})
+    assert found.result.values == {"charge": 0.1}
+    found = rehearse(actions.wait_for, device=bridge, topic="a", values={"hot": "cells.1"})
+    assert said(found.result) == ("error", "bad_result", "yes")
 
 
 SPEED = {

