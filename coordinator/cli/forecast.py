@@ -274,10 +274,14 @@ def _told(physics: str, plant: str = "") -> dict[str, str]:
 
 def _same_form(task: Task, ran: Path) -> bool:
     """Return whether a campaign's copy of its task file, which older campaigns lack, differs from
-    the task in words only."""
+    the task in words only, or in how many runs it asks for."""
+    from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.task.file import dumps
 
-    return ran.is_file() and dumps(load_task(str(ran))) == dumps(task)
+    if not ran.is_file():
+        return False
+    before, now = (dumps(with_runs(one, 1)[0]) for one in (load_task(str(ran)), task))
+    return before == now
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:

@@ -367,7 +367,7 @@ def event_doubts(training: Training) -> list[str]:
     never = exclusive_places(flat.net, place_semiflows(flat.net))
     place = flat.net.place_index
     cut = {w.transition for trial in training.trials for w in trial.waits if w.end is WaitEnd.CUT}
-    out = []
+    out, together = list[str](), dict[str, dict[str, None]]()
     for t in flat.transitions.values():
         remembered = memory_of(flat, t)
         if t.name in cut and remembered is None:
@@ -386,17 +386,19 @@ def event_doubts(training: Training) -> list[str]:
                 for b in u.inputs
             )
             if u is not t and {*t.events} & {*u.events} and not apart:
-                one, other = sorted((t.name, u.name))
-                out.append(
-                    f"{one} and {other} wait for one event, and their waits were interrupted: "
-                    "the simulated net lets it come for each of them by itself"
-                )
+                together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
         if memory is EventMemory.LATCHED and reads_variables(t):
             out.append(
                 f"{t.name} waits for a latched event and reads variables, which the simulated net "
                 "does not know"
             )
-    return list(dict.fromkeys(out))
+    for event, waiting in together.items():
+        *some, last = waiting
+        out.append(
+            f"{', '.join(some)} and {last} wait for one event, {event}, and their waits were "
+            "interrupted: the simulated net lets it come for each of them by itself"
+        )
+    return out
 
 
 def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:

@@ -199,10 +199,10 @@ def test_a_task_that_was_changed_is_forecast_by_the_simulated_net(
     write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The trials are of another form: they tell of its runs, but no figure comes straight from
-    them. A file that differs in words only is the same task."""
+    them. A file that differs in words only, or in the number of runs, is the same task."""
     train = write_campaign("train", TASK, make_trials(200, np.random.default_rng(1), actions=BOTH))
     forms = {
-        "words": "# another comment\n" + TASK.replace("tokens = 4", "tokens  =  4"),
+        "words": "# another comment\n" + TASK.replace("tokens = 4", "tokens = 7"),
         "slower": TASK.replace("deadline = 9.0", "deadline = 8.0"),
         "one action": TASK.replace('"first_a", ', ""),
         "another place": TASK.replace("second", "third"),
