@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -207,7 +208,8 @@ def forecast_agrees(task: Task, states: list[State]) -> None:
         return  # a preemption that forecasts refuse
     fit = [s for s in states if not s.stopping]
     if fit:
-        frozen = Frozen(structure, cast(Drawer, None), {}, np.zeros(len(fit), np.int64))
+        unmeasured = cast(Drawer, SimpleNamespace(as_measured=lambda name: False))
+        frozen = Frozen(structure, unmeasured, {}, np.zeros(len(fit), np.int64))
         frozen.put(fit)
         frozen.agrees(task, fit)
 

@@ -50,6 +50,11 @@ MEMORIES = {
 
 def shared(memory: str, parts: int = 1) -> Task:
     """Return a task in which two branches share an arm; the second one waits for an event."""
+    return loads(shared_text(memory).replace("PARTS", str(parts)), "shared.toml")
+
+
+def shared_text(memory: str) -> str:
+    """Return its text; PARTS stands for the number of parts."""
     text = f"""
 schema = 1
 [task]
@@ -65,7 +70,9 @@ scope = "external"
     for name in SECONDS:
         text += f'[primitive_tasks.{name}]\ngoal = "{name}"\nalternatives = ["{name}"]\n'
         text += "deadline = 9.0\n"
-    text += """
+    return (
+        text
+        + """
 [places]
 parts = { kind = "control", tokens = PARTS }
 ready = { tokens = 1 }
@@ -84,7 +91,7 @@ rested = { in = ["rest:normal"], out = ["ready"] }
 low = { in = ["watching"], out = ["tidy"], event = "alarm" }
 tidied = { in = ["tidy:normal"], out = ["watching"] }
 """
-    return loads(text.replace("PARTS", str(parts)), "shared.toml")
+    )
 
 
 @dataclass
@@ -275,8 +282,58 @@ def test_older_tables_and_files_mean_what_they_meant() -> None:
     assert known.came is None and known.seconds.tolist() == [1.5]
 
 
-def test_an_event_for_two_interrupted_transitions_makes_the_forecast_doubtful() -> None:
-    """The simulated net would let it come for each of them by itself."""
+CHARGING = """
+[task]
+name = "charging"
+runs_place = "parts"
+final = "home == 1"
+[errors]
+to = "broken"
+[places]
+parts = { kind = "control", tokens = 1 }
+out = { kind = "action", task = "work" }
+there = {}
+charge_there = { kind = "action", task = "tidy" }
+back = { kind = "action", task = "rest" }
+here = {}
+charge_here = { kind = "action", task = "tidy" }
+home = { kind = "control" }
+broken = { kind = "control" }
+[transitions]
+start = { in = ["parts"], out = ["out"] }
+arrived = { in = ["out:normal"], out = ["there"] }
+low_there = { in = ["there"], out = ["charge_there"], event = "alarm", priority = 1 }
+turn = { in = ["there"], out = ["back"] }
+full_there = { in = ["charge_there:normal"], out = ["back"] }
+returned = { in = ["back:normal"], out = ["here"] }
+low_here = { in = ["here"], out = ["charge_here"], event = "alarm", priority = 1 }
+stop = { in = ["here"], out = ["home"] }
+full_here = { in = ["charge_here:normal"], out = ["home"] }
+"""
+
+
+@pytest.mark.once
+def test_a_kept_event_serves_the_first_transition_that_can_take_it() -> None:
+    """A low battery is charged after the step in which it comes. The simulated net and the engine
+    agree: it had let the event come for each of the transitions by itself."""
+    head, _, _ = shared_text("kept").partition("[places]")
+    events = head[head.index("[events.alarm]") :]
+    task = loads("schema = 1\n" + CHARGING.replace("[places]", events + "[places]"), "charge.toml")
+    played = missions(task, 1500)
+    charged = [sum(run.action == "tidy" for run in trial.runs) for trial in played.trials]
+    time = np.array([trial.time for trial in played.trials])
+    training = Training.of(task, played.trials)
+    assert {0, 1, 2} <= set(charged)
+    assert event_doubts(training) == []
+    ones = np.ones((1, len(training.trials)))
+    drawer = Drawer(RunDistributions(training), training.waits, ones, np.random.default_rng(1))
+    found = Play(Structure.of(task), drawer, choices_of(training), np.zeros(8_000, np.int64)).run()
+    assert found.time.mean() == pytest.approx(time.mean(), abs=3 * time.std() / sqrt(len(time)))
+
+
+def test_a_pulse_for_two_interrupted_transitions_makes_the_forecast_doubtful() -> None:
+    """The simulated net would let it come for each of them by itself; a latched event serves the
+    first of them."""
     text = """
 schema = 1
 [task]
@@ -300,7 +357,8 @@ second = { in = ["other"], out = ["end"], event = "bell" }
         assert told == []
         cut = [*ended, Waited("first", 1.0, WaitEnd.CUT)]
         (told,) = [event_doubts(Training.of(task, [Trial(1, 0.0, waits=cut)]))]
-        assert ["first and second wait for one event" in doubt for doubt in told] == [True]
+        doubtful = [True] if memory == "pulse" else []
+        assert ["first and second wait for one event" in doubt for doubt in told] == doubtful
 
 
 @pytest.mark.parametrize("memory", MEMORIES)

@@ -18,7 +18,7 @@ marked as an extrapolation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -509,13 +509,15 @@ class Drawer:
             ends.took.max() - np.log1p(-self._random.random(len(columns))) / ends.rate
         )
 
-    def wait(self, transition: str, replicate: Codes) -> Values | None:
-        """Draw the wait of a transition (s) for each column; None if it was never measured."""
-        if transition not in self._waits:
+    def wait(self, transitions: Sequence[str], replicate: Codes) -> Values | None:
+        """Draw the wait of a transition (s) for each column, or of several for one event of which
+        the rate is known; None if it was never measured."""
+        known = [self._waits[name] for name in transitions if name in self._waits]
+        if not known:
             return None
-        seconds, trials, came = self._waits[transition]
+        transition, (seconds, trials, came) = transitions[0], known[0]
         if came is not None:
-            mean = self._mean_waits(transition, seconds, trials, came)[replicate]
+            mean = self._mean_waits(transition, known)[replicate]
             return -mean * np.log1p(-self.chance(len(replicate)))
         index = self._draw(transition, np.full(len(seconds), 1.0 / len(seconds)), trials, replicate)
         drawn: Values = seconds[index]
@@ -526,10 +528,13 @@ class Drawer:
         fire, not since its event could come."""
         return transition in self._waits and self._waits[transition].came is None
 
-    def _mean_waits(self, key: str, seconds: Values, trials: Codes, came: Values) -> Values:
+    def _mean_waits(self, key: str, known: Sequence[Waits]) -> Values:
         """Return the exposure over the occurrences by replicate; over all trials if the event never
         came in those of the replicate."""
         if key not in self._bounds:
+            seconds = np.concatenate([waits.seconds for waits in known])
+            trials = np.concatenate([waits.trial for waits in known])
+            came = np.concatenate([waits.came for waits in known if waits.came is not None])
             each = self._weights[:, trials]
             often = each @ came
             mean = each @ seconds / np.where(often > 0, often, 1.0)

@@ -27,7 +27,15 @@ from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
-from petrobot.coordinator.task import Counts, EarlyEvent, End, EventMemory, Start, Status
+from petrobot.coordinator.task import (
+    Counts,
+    EarlyEvent,
+    End,
+    EventMemory,
+    Start,
+    Status,
+    Task,
+)
 from petrobot.coordinator.task.compiled_task import ActionArc
 from petrobot.coordinator.task.net import Marking
 
@@ -71,6 +79,24 @@ class Played:
     """By action place: how often each transition took a token out of it."""
 
 
+def _shared(moves: Sequence[Move], task: Task, drawer: Drawer) -> dict[str, list[int]]:
+    """Return the numbers of moves that wait for an event or a timer, by their clock: its own, or
+    that of a latched event of which the rate is known. The first of them that can fire consumes
+    it."""
+    clocks: dict[str, list[int]] = {}
+    for i, m in enumerate(moves):
+        own = f" {i}"  # not the name of an event
+        key = task.transitions[m.name].events[0] if _is_latched(m, drawer) else own
+        clocks.setdefault(key, []).append(i)
+    return clocks
+
+
+def _is_latched(m: Move, drawer: Drawer) -> bool:
+    """Return whether the move waits for a latched event of which the rate is known."""
+    latched = m.memory is not None and m.memory[0] is EventMemory.LATCHED
+    return latched and not drawer.as_measured(m.name)
+
+
 class Play:
     """Active trials; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
@@ -95,12 +121,25 @@ class Play:
         for m in structure.moves:
             starts = {p for p, _, is_action in m.transition.produce if is_action}
             (self._barred if starts & unknown else free).append(m)
-        self._quick = [m for m in free if not m.waits]
         self._slow = [m for m in free if m.waits and not m.cause]
+        self._clocks = list(_shared(self._slow, structure.task, drawer).values())
+        """Numbers in `_slow` of transitions that wait for the same coming of an event."""
+        latched = {
+            self._slow[i].number: clock
+            for clock, members in enumerate(self._clocks)
+            for i in members
+            if _is_latched(self._slow[i], drawer)
+        }
+        self._quick = [m for m in free if not m.waits or m.number in latched]
+        """Transitions that fire without time: those that wait for nothing, and those whose event
+        has come before."""
+        self._latched = [latched.get(m.number) for m in self._quick]
+        """Their clocks."""
         self._certain = [
             m
             for m in self._quick
             if m.ended
+            and not m.waits
             and (m.allowed is not None or structure.task.transitions[m.name].when is None)
         ]
         """Transitions that take an ended run and surely fire as soon as the marking allows it."""
@@ -108,6 +147,7 @@ class Play:
         self._contests = [
             (i, place, weight)
             for i, m in enumerate(self._quick)
+            if not m.waits
             for place, weight in m.transition.plain
             if place in contested.get(m.number, ())
         ]
@@ -132,7 +172,7 @@ class Play:
         self._entered, self._ended = np.zeros((2, *self._phase.shape), np.int64)
         """By run: its number among those that came, and among those that ended."""
         self._entries = self._ends_so_far = 0
-        self._due = np.full((len(self._slow), n), np.inf)
+        self._due = np.full((len(self._clocks), n), np.inf)
         self._odd: dict[str, dict[str, set[int]]] = {}
         self._ways: dict[str, dict[str, int]] = {}
         names, actions = sorted(set((devices or {}).values())), structure.vocabulary.actions
@@ -191,6 +231,9 @@ class Play:
         pending = np.zeros((len(self._quick), len(self._column)), np.bool_)
         for _ in range(LONGEST):
             able = np.array([self._enabled(m) for m in self._quick])
+            for i, clock in enumerate(self._latched):
+                if clock is not None:
+                    able[i] &= self._due[clock] <= self._now
             some: Mask = np.asarray(able.any(axis=0))
             if not some.any():
                 if self._release():
@@ -203,6 +246,8 @@ class Play:
             for i, move in enumerate(self._quick):
                 columns = np.flatnonzero(chosen == i)
                 if len(columns):
+                    if (clock := self._latched[i]) is not None:
+                        self._due[clock, columns] = np.inf
                     self._fire(move, columns)
                     pending[i, columns] = False
         raise ValueError(
@@ -437,15 +482,20 @@ class Play:
         """Draw when the events of transitions that wait will come, as soon as they can serve them,
         and forget it when they cannot any more. Return when each transition will fire, if nothing
         happens before."""
-        fires = np.full_like(self._due, np.inf)
-        for i, move in enumerate(self._slow):
-            able = self._enabled(move)
-            served = self._served(move, able)
-            fresh = np.flatnonzero(served & np.isinf(self._due[i]))
+        fires = np.full((len(self._slow), len(self._column)), np.inf)
+        for due, members in zip(self._due, self._clocks, strict=True):
+            moves = [self._slow[i] for i in members]
+            able = [self._enabled(move) for move in moves]
+            served = np.any([self._served(m, a) for m, a in zip(moves, able, strict=True)], axis=0)
+            fresh = np.flatnonzero(served & np.isinf(due))
             if len(fresh):
-                self._due[i, fresh] = self._now[fresh] + self._drawn_wait(move, fresh)
-            self._due[i, ~served] = np.inf
-            fires[i, able] = np.maximum(self._due[i, able], self._now[able])
+                due[fresh] = self._now[fresh] + self._drawn_wait(moves, fresh)
+            due[~served] = np.inf
+            free = np.ones(len(self._column), np.bool_)  # the event serves one of them
+            for k in sorted(range(len(moves)), key=lambda k: -moves[k].priority):
+                first = able[k] & free
+                fires[members[k], first] = np.maximum(due[first], self._now[first])
+                free &= ~first
         return fires
 
     def _served(self, move: Move, able: Mask) -> Mask:
@@ -461,8 +511,9 @@ class Play:
             return concession(self._s.rule, self._tokens, move.number)
         return able
 
-    def _drawn_wait(self, move: Move, columns: Codes) -> Values:
-        drawn = self._drawer.wait(move.name, self._replicate[columns])
+    def _drawn_wait(self, moves: Sequence[Move], columns: Codes) -> Values:
+        drawn = self._drawer.wait([m.name for m in moves], self._replicate[columns])
+        move = moves[0]
         if drawn is not None:
             return drawn
         if move.transition.after is not None:
@@ -482,11 +533,11 @@ class Play:
         self._now = np.where(moving, soonest, self._now)
         for number in range(len(self._end)):
             self._end_runs(number, np.flatnonzero(moving & (ends <= dues) & (run == number)))
-        for number, move in enumerate(self._slow):
+        for clock, number in ((c, i) for c, members in enumerate(self._clocks) for i in members):
             columns = np.flatnonzero(moving & (dues < ends) & (i == number))
             if len(columns):
-                self._due[number, columns] = np.inf
-                self._fire(move, columns)
+                self._due[clock, columns] = np.inf
+                self._fire(self._slow[number], columns)
         self._free(np.flatnonzero(~moving))
 
     def _end_runs(self, run: int, columns: Codes) -> None:

@@ -23,7 +23,7 @@ from petrobot.coordinator.studies.forecast.history import (
 )
 from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
-from petrobot.coordinator.task import EarlyEvent, EventMemory
+from petrobot.coordinator.task import EarlyEvent, EventMemory, Transition
 
 LEVEL = 0.01
 """Significance level at which simulated and measured trials differ, over all tests of a regime
@@ -385,7 +385,12 @@ def event_doubts(training: Training) -> list[str]:
                 for a in t.inputs
                 for b in u.inputs
             )
-            if u is not t and {*t.events} & {*u.events} and not apart:
+            if (
+                u is not t
+                and {*t.events} & {*u.events}
+                and not apart
+                and not (memory is EventMemory.LATCHED and _by_rate(training, u))
+            ):
                 together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
         if memory is EventMemory.LATCHED and reads_variables(t):
             out.append(
@@ -399,6 +404,13 @@ def event_doubts(training: Training) -> list[str]:
             "interrupted: the simulated net lets it come for each of them by itself"
         )
     return out
+
+
+def _by_rate(training: Training, t: Transition) -> bool:
+    """Return whether the simulated net lets one event come for this transition and others."""
+    waits = training.waits.get(t.name)
+    alone = memory_of(training.task.flat, t) is not None
+    return alone and (waits is None or waits.came is not None)
 
 
 def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:
