@@ -159,6 +159,17 @@ async def test_step_fires_once(petrobot: Terminal) -> None:
     await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
 
 
+async def test_a_step_of_an_active_run_says_that_it_is_paused_now(petrobot: Terminal) -> None:
+    """Who did not pause it would leave the robot standing."""
+    stepping = asyncio.create_task(petrobot("step"))
+    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.STEPPING)
+    await petrobot("raise", "part_there")
+    told = (await stepping).out
+    assert "fired start" in told and "the run was not paused, and is now" in told
+    await petrobot("raise", "part_there")
+    assert "now" not in (await petrobot("step")).out
+
+
 async def test_breakpoints(petrobot: Terminal) -> None:
     """They are set, listed, reached and removed."""
     assert "start" in (await petrobot("break", "start")).out
