@@ -256,6 +256,22 @@ async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot
     assert (await operation.command(who, "pause", {}))["ok"]
 
 
+async def test_watch_shows_tokens_and_events_of_the_operator(petrobot: Terminal) -> None:
+    """A command that was refused is not shown."""
+    watching = asyncio.create_task(petrobot("watch"))
+    await petrobot.until(lambda: petrobot.operation.feed.watched)
+    commands = ["pause", "token jobs +3", "token jobs -1", "token jobs +5", "raise part_there"]
+    # All write to one terminal.
+    out = [(await petrobot(*command.split())).out for command in (*commands, "abort")]
+    out.append((await watching).out)
+    lines = [line for line in "".join(out).splitlines() if "command  " in line]
+    assert [line.partition("command  ")[2] for line in lines] == [
+        "operator put 3 into jobs",
+        "operator took 1 out of jobs",
+        "event part_there, raised by the operator",
+    ]
+
+
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
     """The reason names the operator."""
     watching = asyncio.create_task(petrobot("watch"))
