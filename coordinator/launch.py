@@ -35,7 +35,7 @@ from petrobot.coordinator.run.recording import (
     stages,
 )
 from petrobot.coordinator.run.supervisor import Program, Supervisor, is_local
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Scope, Task
 from petrobot.coordinator.task.wording import nearest
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import Directory, NodeEntry, module_name
@@ -76,26 +76,44 @@ def load_object(path: str) -> Any:
     return getattr(importlib.import_module(module_name(module)), name)
 
 
-def scripted_actions(mock: Path | None, directory: Directory) -> Substitutes | None:
+def scripted_actions(
+    mock: Path | None, directory: Directory, task: Task | None = None
+) -> Substitutes | None:
     """The actions of a script (`--mock`), None without one. Raises RequestError for a file that
-    cannot be used, or that names an action that the cell does not have."""
+    cannot be used, that names an action that the cell does not have, or that raises an event that
+    the `task` does not expect from its action."""
     if mock is None:
         return None
     try:
-        scripted: Substitutes = load_object(SCRIPTED)(mock)
+        scripted: Mapping[str, Any] = load_object(SCRIPTED)(mock)
     except OSError as fault:
         raise RequestError(f"{mock}: {fault.strerror}; give a file of scripted actions") from fault
     except Exception as fault:
         raise RequestError(str(fault)) from fault
-    for name in scripted:
+    for name, script in scripted.items():
+        what = ""
         if name not in directory.actions:
+            what = f"{directory.source} has no such action{nearest(name, directory.actions)}"
+            what += "; name one of its actions, or remove it here"
+        elif task is not None:
+            what = "; ".join(filter(None, (_not_its_own(task, name, e) for e in script.events)))
+        if what:
             key = f"actions.{name}"
             line = line_of(key, key_lines(mock.read_text(encoding="utf-8")))
-            what = f"{directory.source} has no such action{nearest(name, directory.actions)}"
-            raise RequestError(
-                f"{mock}:{line}: {key}: {what}; name one of its actions, or remove it here"
-            )
+            raise RequestError(f"{mock}:{line}: {key}: {what}")
     return scripted
+
+
+def _not_its_own(task: Task, action: str, name: str) -> str:
+    """Return why an event of the task would be ignored if a run of the action raised it."""
+    event = task.flat.events.get(name)
+    users = [p.name for p in task.primitive_tasks.values() if action in p.alternatives]
+    if event is None or not users or event.by in users:
+        return ""
+    if event.scope is Scope.EXTERNAL:
+        remedy = "let a driver or a timer raise it, or `petrobot raise`; remove it here"
+        return f"{name!r} is an external event of {task.name}, which no action raises; {remedy}"
+    return f"{name!r} is an event of {event.by}, which does not have this action; remove it here"
 
 
 def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:

@@ -18,7 +18,7 @@ events = [{ after = 0.1, name = "contact", data = { force = 2.0 } }]
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,11 @@ class Scripted:
         self._lines = tuple(lines)
         self._runs = 0
 
+    @property
+    def events(self) -> tuple[str, ...]:
+        """Names of the events that its runs raise."""
+        return tuple(dict.fromkeys(cue.name for line in self._lines for cue in line.events))
+
     def __call__(self, ctx: Context, **_: Any) -> Awaitable[Result]:
         """Play the next line."""
         line = self._lines[self._runs % len(self._lines)]
@@ -90,7 +95,7 @@ async def _play(ctx: Context, line: ScriptedRun) -> Result:
     return Result(line.status, line.values, line.cause, line.text, line.deferred)
 
 
-def load(path: str | Path) -> dict[str, Callable[..., Any]]:
+def load(path: str | Path) -> dict[str, Scripted]:
     """Scripted actions by name. Raises ScriptError with every fault of the file, OSError when it
     cannot be read."""
     source = Path(path)
@@ -99,7 +104,7 @@ def load(path: str | Path) -> dict[str, Callable[..., Any]]:
     except TomlError as fault:
         raise ScriptError(str(fault)) from fault
     faults = [f"{source}: {f}" for f in _top_faults(data)]
-    scripted: dict[str, Callable[..., Any]] = {}
+    scripted: dict[str, Scripted] = {}
     for name, rule in data.get("actions", {}).items() if not faults else ():
         try:
             lines = [_line(table) for table in (rule if isinstance(rule, list) else [rule])]

@@ -89,7 +89,7 @@ COMMANDS = (
         "operate:PauseRun",
     ),
     Subcommand("continue", "continue the paused run", "operate:ContinueRun"),
-    Subcommand("step", "fire one transition of the paused run", "operate:StepRun"),
+    Subcommand("step", "fire one transition of the run, then pause", "operate:StepRun"),
     Subcommand(
         "break",
         "pause before a transition fires or when a place is entered",

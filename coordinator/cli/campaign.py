@@ -278,7 +278,7 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     refusal = may_run(task, cell_of(directory)).refusal(str(directory.source))
     if refusal:
         raise CommandError(2, refusal)
-    refuse_script(options.mock, directory)
+    refuse_script(options.mock, directory, task)
     if not options.cluster:
         scripted = options.mock is not None
         refuse_misplaced(directory, everywhere=True, scripted=scripted)

@@ -249,12 +249,14 @@ def _with_code(
     drivers = {device.name: code.get(device.driver, {}) for device in directory.devices.values()}
     raised, complete = _raised(task, directory, code)
     services = _services(directory, code)
-    found = list(code_findings(task, by_action, args, services, [*drivers.values()], raised))
     lines = key_lines(read_text(directory.source))
 
     def where(key: str) -> str:
         return f"{directory.source}:{line_of(key, lines)}: {key}"
 
+    timers = {name: where(f"timers.{name}") for name in directory.timers}
+    facts = (by_action, args, services, [*drivers.values()], raised, timers)
+    found = list(code_findings(task, *facts))
     found += given_findings(by_action, args, where)
     found += occupied(task, {action.name: action.device for action in actions})
     for stream in directory.streams.values():

@@ -371,12 +371,12 @@ def refuse_arguments(
         raise CommandError(2, "\n".join(told))
 
 
-def refuse_script(mock: Path | None, directory: Directory) -> None:
-    """Refuse a file of scripted actions that cannot be used with this cell."""
+def refuse_script(mock: Path | None, directory: Directory, task: Task | None = None) -> None:
+    """Refuse a file of scripted actions that cannot be used with this cell, or this task."""
     from petrobot.coordinator.launch import RequestError, scripted_actions
 
     try:
-        scripted_actions(mock, directory)
+        scripted_actions(mock, directory, task)
     except RequestError as fault:
         raise CommandError(2, str(fault)) from fault
 

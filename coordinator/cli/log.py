@@ -153,15 +153,32 @@ def _text(found: Recorded) -> Iterator[str]:
     yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
     if found.journal.torn_bytes:
         yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
+    event, again, until = None, 0, ""
     for step in with_asides(found.journal, found.steps()):
-        when = f"{step.number:5} {step.time:10.3f} s  "
+        at = f"{step.time:.3f} s"
         if isinstance(step, Remark):
-            yield f"{when}remarked  {step.author:20} {step.text}"
+            rows = [("remarked", step.author, step.text)]
         elif isinstance(step, TakeOver):
-            yield f"{when}resumed   {'':20} {step.told}"
+            rows = [("resumed", "", step.told)]
         else:
-            for word, of, text in _lines(step, found.engine):
-                yield without_controls(f"{when}{word:9} {of:20} {text}".rstrip())
+            rows = list(_lines(step, found.engine))
+        # A button that was pressed while no coordinator was there would fill the screen.
+        if rows == [event]:
+            again, until = again + 1, at
+            continue
+        if again and rows:
+            yield _repeated(again, until)
+        if rows:
+            event, again = rows[0] if rows[0][0] == "event" else None, 0
+        for word, of, text in rows:
+            line = f"{step.number:5} {at:>12}  {word:9} {of:20} {text}".rstrip()
+            yield line if isinstance(step, Remark | TakeOver) else without_controls(line)
+    if again:
+        yield _repeated(again, until)
+
+
+def _repeated(again: int, until: str) -> str:
+    return f"{'':20}the same {again} times more, until {until}"
 
 
 def _lines(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]:

@@ -218,8 +218,11 @@ class StepRun(OperatorCommand):
     verb = "step"
     firings = 0
     """How many the run had before the command."""
+    active = False
+    """Whether the run was not paused before the command."""
 
     def data(self, client: OperatorClient) -> dict[str, Any]:
+        self.active = client.state["paused"] is None
         self.firings = int(client.state["mission"].get("firings", 0))
         return {}
 
@@ -230,7 +233,10 @@ class StepRun(OperatorCommand):
             return "no transition can fire yet; the run will pause after the next firing"
         firing = client.state["firings"][-1]
         answer["firing"] = firing
-        return f"fired {firing['transition']} ({firing['cause']})"
+        told = f"fired {firing['transition']} ({firing['cause']})"
+        if self.active:
+            told += "; the run was not paused, and is now: `petrobot continue`"
+        return told
 
 
 class SetBreakpoint(OperatorCommand):

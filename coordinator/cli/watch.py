@@ -116,6 +116,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         f"started  {c['run']['id']}  {c['run']['action']} on {c['run']['node'] or 'no node'}"
     ),
     "run_ended": _ended,
+    "command": lambda c: f"command  {c['text']}",
     "paused": _paused,
     "mission": _mission,
     "notice": lambda c: f"{c['notice']['level']:8} {c['notice']['text']}",

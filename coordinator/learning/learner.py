@@ -43,7 +43,7 @@ from petrobot.coordinator.learning.statistics import added
 from petrobot.coordinator.learning.trial_tokens import NOBODY, TrialTokens
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
 from petrobot.coordinator.task.conditions import parse as parse_condition
 from petrobot.services.comm.protocol.messages import Feedback
@@ -309,12 +309,14 @@ class LearningSelector(FirstAlternative):
         active = self._active.pop(record.run, _ActiveRun(now))
         context = self.context if active.context is None else active.context
         # A preempted run lasted until the transition took its token; its node may report the
-        # cancelled run later. Any other run lasted as long as its node says.
+        # cancelled run later. One that was lost with its node lasted until that was noticed. Any
+        # other run lasted as long as its node says.
         preempted = (active.taken_by or "") if record.cancelled else None
+        lost = record.executed is Executed.UNKNOWN and not record.seconds
         until = active.taken_at if preempted else now
         seconds = (
             max(0.0, record.seconds)
-            if preempted is None
+            if preempted is None and not lost
             else round(max(0.0, until - active.entered), 6)
         )
         result = active.ended

@@ -127,9 +127,9 @@ _RULES: dict[str, Callable[[State, Change], None]] = {
     **dict.fromkeys(_TABLES, _entry),
     **dict.fromkeys(_WHOLE, _whole),
 }
-KINDS = frozenset(_RULES) | {"reset"}
+KINDS = frozenset(_RULES) | {"reset", "command"}
 """Kinds of change. `reset` means that so much is new (another mission) that clients get a snapshot
-instead."""
+instead. `command` changes nothing: who follows the run reads it."""
 
 
 def apply(state: State, change: Change) -> None:

@@ -272,7 +272,10 @@ async def _latch(directory: Directory, node: str) -> str:
         path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
     except LatchError as fault:
         return f"not latched: {fault}; do not start {node} again before the cell is safe"
-    return f"latched: {path} keeps its devices stopped until `petrobot estop --clear`"
+    return (
+        f"latched: a {node} that runs with {directory.source} keeps its devices stopped, by "
+        f"{path}, until `petrobot estop --clear`"
+    )
 
 
 async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:

@@ -282,7 +282,7 @@ def _new(
 ) -> RunSession:
     """Make a new run; `texts` are those of the task file and of services.toml."""
     lockstep = request.mode == LOCKSTEP
-    script = scripted_actions(request.mock, directory)  # Refused before a folder is made.
+    script = scripted_actions(request.mock, directory, setting.task)  # before a folder is made
     physics = _physics(directory)
     identity = mission_id(setting.task)
     folder = None if request.folder is None else request.folder / identity

@@ -36,6 +36,7 @@ from petrobot.coordinator.operator.event_texts import (
     plain_value,
     reason_of,
     reason_recorded,
+    told,
 )
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.port import Feed
@@ -80,7 +81,7 @@ class ChangePublisher:
         }
         self._tell: Mapping[type, Callable[[float, Any], None]] = {
             Fired: self._fired,
-            Marked: lambda t, i: self._marking(t, i.before, i.after),
+            Marked: self._marked,
             StartRun: self._started,
             CancelRun: lambda t, i: self._state(t, i.run, "stopping"),
             HoldRun: lambda t, i: self._state(t, i.run, "holding"),
@@ -139,6 +140,8 @@ class ChangePublisher:
             if known is not None:
                 event = {**known, "count": known["count"] + 1, "last": round(time, 4)}
                 self.feed.emit("event", time=time, name=stimulus.event, event=event)
+            if isinstance(stimulus, RaiseEvent):
+                self.feed.emit("command", time=time, text=told(stimulus))
         elif isinstance(stimulus, Abort):
             self._aborted = True
         elif isinstance(stimulus, RunHeld):
@@ -207,6 +210,11 @@ class ChangePublisher:
         self.feed.emit("fired", time=time, firing=firing)
         self._marking(time, fired.before, fired.after)
         self.feed.emit("mission", time=time, mission={"firings": fired.number})
+
+    def _marked(self, time: float, marked: Marked) -> None:
+        if marked.place:
+            self.feed.emit("command", time=time, text=told(self._stimulus))
+        self._marking(time, marked.before, marked.after)
 
     def _marking(self, time: float, before: Marking, after: Marking) -> None:
         places = self._net.places

@@ -39,7 +39,10 @@ class Fault:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` when a known word is close, else nothing."""
-    near = get_close_matches(word, list(known), 1)
+    words = list(known)
+    near = get_close_matches(word, words, 1)
+    if not near and len(word) > 3:  # a name that was made longer or shorter
+        near = [w for w in words if len(w) > 3 and (w.startswith(word) or word.startswith(w))]
     return f" (did you mean '{near[0]}'?)" if near else ""
 
 

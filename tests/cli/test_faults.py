@@ -55,6 +55,8 @@ def petrobot(
         "services.toml": CELL,
         "rates.toml": "[rates]\n",
         "mock.toml": "schema = 1\n[actions.work]\nseconds = 1\n[[actions.recovre]]\nseconds = 1\n",
+        "bell.toml": WORK + "\n[events.bell]\n",
+        "bell_mock.toml": 'schema = 1\n[actions.work]\nevents = [{ name = "bell" }]\n',
         "list.json": "[]",
         "result.json": "[]",
         "campaign.json": '{"schema": 1}',
@@ -100,6 +102,14 @@ def petrobot(
             "mock.toml:4: actions.recovre: services.toml has no such action",
         ),
         (
+            "run bell.toml --mode lockstep --mock bell_mock.toml",
+            "bell_mock.toml:2: actions.work: 'bell' is an external event of work, which no action",
+        ),
+        (
+            "campaign bell.toml --mock bell_mock.toml",
+            "bell_mock.toml:2: actions.work: 'bell' is an external event of work, which no action",
+        ),
+        (
             "check work.toml --services no.toml",
             "no.toml: No such file or directory; give --services a location file",
         ),
@@ -133,7 +143,7 @@ def petrobot(
         ),
         (
             "campaign work.toml --learned .",
-            "result.json: not the result of a campaign: selector or policy is missing",
+            "result.json: not the result of a campaign: task, selector or policy is missing",
         ),
         (
             "campaign --resume work.toml",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -88,16 +89,18 @@ STORY: tuple[tuple[Stimulus, str], ...] = (
 )  # fmt: skip
 
 
+HEADER: dict[str, Any] = {
+    "mission": "desk-1", "mode": "realtime", "task": TASK, "services": SERVICES, "seed": 1,
+    "services_path": "services.toml", "runs": 1, "parameters": {}, "date": "2026-01-01",
+    "devices": {},
+}  # fmt: skip
+
+
 def recorded(folder: Path, begun: float = 0.0) -> Path:
     """Write the journal of the story; another coordinator continues it after its first half."""
     engine = Engine(loads(TASK, "desk.toml"))
-    header = {
-        "mission": "desk-1", "mode": "realtime", "task": TASK, "services": SERVICES, "seed": 1,
-        "services_path": "services.toml", "runs": 1, "parameters": {}, "date": "2026-01-01",
-        "devices": {},
-    }  # fmt: skip
     path = folder / "run.journal"
-    with closing(JournalWriter(path, header)) as writer:
+    with closing(JournalWriter(path, HEADER)) as writer:
         store, state = JournalStore(writer, 0.0), engine.initial()
         for i, (stimulus, _) in enumerate(STORY):
             if i == len(STORY) // 2:
@@ -120,6 +123,33 @@ def test_the_log_shows_all_that_moves_or_explains_a_token(
     assert resumed[5:] == (
         f"{7.5:11.3f} s  resumed   {'':20} another coordinator continues the run (epoch 2)"
     )
+
+
+def test_equal_events_one_after_the_other_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of ten minutes without a coordinator come when it is back. Another line ends the
+    count, as does the end of the log."""
+    engine = Engine(loads(TASK, "desk.toml"))
+    press, low = EventOccurred("press", "button"), EventOccurred("low", "arm")
+    path = tmp_path / "run.journal"
+    with closing(JournalWriter(path, HEADER)) as writer:
+        store, state = JournalStore(writer, 0.0), engine.initial()
+        story: tuple[Stimulus, ...] = (Begin(), *[press] * 90, low, low, press, press, press)
+        for i, stimulus in enumerate(story):
+            state, instructions = engine.handle(state, stimulus)
+            store.append(i, stimulus, instructions, state)
+    assert main(["log", str(path)]) == 0
+    shown = [line[20:] for line in capsys.readouterr().out.splitlines() if line[0] == " "]
+    kept = "event     press                from button: kept until a transition takes it"
+    assert shown[-6:] == [
+        kept,
+        "the same 89 times more, until 90.000 s",
+        "event     low                  from arm: nothing waited for it",
+        "the same 1 times more, until 92.000 s",
+        kept,
+        "the same 2 times more, until 95.000 s",
+    ]
 
 
 def test_a_report_has_the_times_of_the_log(

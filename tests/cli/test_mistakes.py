@@ -1482,6 +1482,26 @@ def test_an_event_that_a_driver_misspells_is_told(
     expect(told, CHECK, 0)
 
 
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("timer", "told"),
+    [
+        ("dusty_lens", r"warning .*timers.dusty_lens: a timer raises .*did you mean 'dust'"),
+        ("beat", r"note .*timers.beat: a timer raises .* and nothing raises dust"),
+    ],
+)
+def test_a_timer_whose_name_is_no_event_of_the_task_is_told(
+    sound: dict[str, str], timer: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mistakes: list[Mistake] = [
+        (TASK, "[errors]", '[events.dust]\nscope = "external"\n\n[errors]', ""),
+        (CELL, "[nodes]", TIMER.replace("button", timer), ""),
+    ]
+    damaged(sound, mistakes, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(told, CHECK, 0)
+
+
 RAISED = 'self.ports.raise_event("button")\n        if not self.paused:'
 TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes]'
 

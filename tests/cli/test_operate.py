@@ -159,6 +159,17 @@ async def test_step_fires_once(petrobot: Terminal) -> None:
     await until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
 
 
+async def test_a_step_of_an_active_run_says_that_it_is_paused_now(petrobot: Terminal) -> None:
+    """Who did not pause it would leave the robot standing."""
+    stepping = asyncio.create_task(petrobot("step"))
+    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.STEPPING)
+    await petrobot("raise", "part_there")
+    told = (await stepping).out
+    assert "fired start" in told and "the run was not paused, and is now" in told
+    await petrobot("raise", "part_there")
+    assert "now" not in (await petrobot("step")).out
+
+
 async def test_breakpoints(petrobot: Terminal) -> None:
     """They are set, listed, reached and removed."""
     assert "start" in (await petrobot("break", "start")).out
@@ -243,6 +254,22 @@ async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot
         assert "; give " in answer["text"]
     assert (await operation.command(who, "remark", {"text": "still works"}))["ok"]
     assert (await operation.command(who, "pause", {}))["ok"]
+
+
+async def test_watch_shows_tokens_and_events_of_the_operator(petrobot: Terminal) -> None:
+    """A command that was refused is not shown."""
+    watching = asyncio.create_task(petrobot("watch"))
+    await petrobot.until(lambda: petrobot.operation.feed.watched)
+    commands = ["pause", "token jobs +3", "token jobs -1", "token jobs +5", "raise part_there"]
+    # All write to one terminal.
+    out = [(await petrobot(*command.split())).out for command in (*commands, "abort")]
+    out.append((await watching).out)
+    lines = [line for line in "".join(out).splitlines() if "command  " in line]
+    assert [line.partition("command  ")[2] for line in lines] == [
+        "operator put 3 into jobs",
+        "operator took 1 out of jobs",
+        "event part_there, raised by the operator",
+    ]
 
 
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:

@@ -258,6 +258,19 @@ def test_a_run_that_ended_provisionally_counts_in_r_when_it_is_judged(task: Task
     assert (learned.runs[0, 1], learned.successes[0, 1]) == (1.0, 0.0)
 
 
+def test_a_run_that_was_lost_with_its_node_cost_the_time_until_that_was_noticed(
+    task: Task,
+) -> None:
+    """Its node reports no time. As a run of no time it would make its action the cheapest one."""
+    selector = learner(task, seed=1)
+    selector.settled(0.0, State((0,), {"regime": "A"}))
+    selector.instruction(1.0, StartRun("pick#1", "pick", "pick", "pick_slow", {}, 5.0))
+    which = ("pick#1", "pick", "pick", "pick_slow", Status.ERROR)
+    selector.instruction(1.5, RunRecorded(*which, "lost", "", Executed.UNKNOWN, 0.0))
+    tally = selector.learning.estimates.tally(TallyKey("pick", "pick_slow", "regime=A"))
+    assert (tally.wall.n, tally.wall.mean) == (1, 0.5)
+
+
 def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> None:
     """In one context all experience counts; over scenarios the declared target (0.9) excludes
     actions that never reach it."""

@@ -66,7 +66,11 @@ def report_html(
         ),
         section("Runs over time", picture(gantt_svg(timeline))),
         *(section(heading, gallery(svgs)) for heading, svgs in (measured or {}).items()),
-        *(section(key.capitalize(), table(rows)) for key, rows in result.items() if is_table(rows)),
+        *(
+            section(key.replace("_", " ").capitalize(), table(rows))
+            for key, rows in result.items()
+            if is_table(rows)
+        ),
         section("The net", apart(net_svg, "the net") if net_svg else ""),
         section("What went wrong", _faults(timeline)),
         section("Firings", _firings(timeline)),

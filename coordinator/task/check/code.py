@@ -8,6 +8,7 @@ Actions of other hosts are not known here and are left out.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from petrobot.coordinator.task import (
@@ -49,10 +50,12 @@ def code_findings(
     services: Mapping[str, Mapping[str, Any]],
     drivers: Collection[Mapping[str, Any]] = (),
     raised: Collection[str] = (),
+    timers: Mapping[str, str] = MappingProxyType({}),
 ) -> Iterator[Finding]:
     """What does not fit. `args` are the arguments of each action in the location file, `services`
     what is known of each other service that it offers, `drivers` what is known of the drivers of
-    all its devices, and `raised` the events that it is known to raise."""
+    all its devices, `raised` the events that it is known to raise, and `timers` where it declares
+    each timer."""
     given = {"prepare": {*task.parameters, "seed", "runs"}, "score": {"cycles"}}
     for key, service in (("prepare", task.prepare), ("score", task.score)):
         if service and service not in services and service not in args:
@@ -83,7 +86,7 @@ def code_findings(
         yield from _events(task, action, code[action])
         yield from _unknown_services(code[action], {*services, *args})
     yield from dict.fromkeys(f for action in used for f in _unknown_states(code[action]))
-    yield from _undeclared(task, drivers, raised)
+    yield from _undeclared(task, drivers, raised, timers)
     actions = [code[action] for action in used]
     for kind, severity in (("faults", Severity.ERROR), ("doubtful", Severity.WARNING)):
         found = {tuple(one) for facts in (*actions, *drivers) for one in facts.get(kind, ())}
@@ -342,22 +345,26 @@ def _unraised(task: Task, code: Code) -> Iterator[Finding]:
 
 
 def _undeclared(
-    task: Task, drivers: Iterable[Mapping[str, Any]], raised: Collection[str]
+    task: Task,
+    drivers: Iterable[Mapping[str, Any]],
+    raised: Collection[str],
+    timers: Mapping[str, str],
 ) -> Iterator[Finding]:
-    """Events that a driver raises and the task does not have, while the task has one that nothing
-    raises. Otherwise they are those of other tasks."""
+    """Events that a driver or a timer raises and the task does not have, while the task has one
+    that nothing raises. Otherwise they are those of other tasks."""
     silent = [e.name for e in task.events.values()
               if e.scope is Scope.EXTERNAL and e.name not in raised]  # fmt: skip
-    places = {name: tuple(place) for driver in drivers
-              for name, place in driver.get("events", {}).items()}  # fmt: skip
-    for name, (file, line) in sorted(places.items()) if silent else ():
+    sources = {name: ("driver", f"{place[0]}:{place[1]}") for driver in drivers
+               for name, place in driver.get("events", {}).items()}  # fmt: skip
+    sources |= {name: ("timer", place) for name, place in timers.items()}
+    for name, (source, place) in sorted(sources.items()) if silent else ():
         if name not in task.events:
             hint = nearest(name, silent)
-            text = f"a driver raises the event {name!r}, which the task does not declare{hint}"
+            text = f"a {source} raises the event {name!r}, which the task does not declare{hint}"
             text += "" if hint else f", and nothing raises {listed(silent)}"
             remedy = f"correct the name, or declare [events.{name}]"
             severity = Severity.WARNING if hint else Severity.NOTE
-            yield Finding(severity, "code", f"{file}:{line}", text, remedy)
+            yield Finding(severity, "code", place, text, remedy)
 
 
 def _events(task: Task, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:
