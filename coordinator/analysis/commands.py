@@ -268,10 +268,20 @@ def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], l
 
     Structure, the verdicts of progress and the distribution of the completion time are computed
     only now, so Ctrl-C may arrive here, or time or memory be used up: then the forecast is left
-    out, and what is not known stays unknown.
+    out, and what is not known stays unknown. Of a forecast that lacks only that distribution
+    nothing else is left out.
     """
     try:
-        return found, found.to_json(structure=structure), [found.text()]
+        data = found.to_json(structure=structure)
+        numbers = found.forecast
+        if numbers is None or numbers.completion_probability == 0 or data["forecast"]["quantiles"]:
+            return found, data, [found.text()]
+        if LATE not in found.notes:
+            found, data["notes"] = (
+                replace(found, notes=(*found.notes, LATE)),
+                [*data["notes"], LATE],
+            )
+        return found, data, [found.text()]
     except KeyboardInterrupt:
         note, cut = CUT, True
     except OutOfTime:

@@ -367,11 +367,8 @@ class Analysis:
         """Return the numbers by which two analyses are compared."""
         if self.forecast is not None:
             f = self.forecast
-            shape = (
-                {"90 % quantile of the time (s)": f.completion_time().quantile(0.9)}
-                if f.completion_probability > 0
-                else {}
-            )
+            late = f.quantiles(0.9)
+            shape = {"90 % quantile of the time (s)": late["0.9"]} if late else {}
             return f.figures | shape
         if self.run is not None:
             return {f"throughput of {t} (1/s)": x for t, x in self.run.throughput.items()}

@@ -187,7 +187,9 @@ def _plain(
         "break_even": _break_even(judged),
     }
     if options.target is not None:
-        about["to_reach"] = _answer(cost_to_reach(judged.figures, options.target))
+        # A target that no lower bound meets is not reached by a mean of a few runs either.
+        reached = None if judged.unmet else cost_to_reach(judged.figures, options.target)
+        about["to_reach"] = _answer(reached)
     if options.budget is not None:
         about["for_cost"] = _answer(reliability_for(judged.figures, options.budget))
     about["by_context"] = _by_context(tallies, replace(asked, target=None, rho=judged.rho))
@@ -493,18 +495,17 @@ def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]
         f"{b['against']} is better than {about['best']} {b['better']} rho = {b['rho']:.4g}"
         for b in about["break_even"]
     ]
-    for key, words in (
-        ("to_reach", f"R {options.target} costs least with"),
-        ("for_cost", f"cost {options.budget} buys"),
+    for key, asked, verb, none in (
+        ("to_reach", f"R {options.target}", "costs least with", "is met by no action so far"),
+        ("for_cost", f"cost {options.budget}", "buys", "buys nothing known"),
     ):
         if key in about:
             answer = about[key]
-            said = (
-                "nothing known"
-                if answer is None
-                else f"{answer['action']}: R {answer['R']:.3f}, C {answer['C']:.4g}"
-            )
-            lines.append(f"{words} {said}")
+            if answer is None:
+                lines.append(f"{asked} {none}")
+            else:
+                said = f"{answer['action']}: R {answer['R']:.3f}, C {answer['C']:.4g}"
+                lines.append(f"{asked} {verb} {said}")
     for name, selector in about["selectors"].items():
         for context, p in selector["contexts"].items():
             shares = ", ".join(f"{action} {share:.3f}" for action, share in p.items())

@@ -9,8 +9,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
-from math import copysign, hypot, inf
+from itertools import pairwise, starmap
+from math import ceil, copysign, dist, hypot, inf
 
 from petrobot.coordinator.drawing.layout import Point
 from petrobot.coordinator.drawing.scene import RADIUS, Arc, DrawnNode, Scene
@@ -18,12 +18,14 @@ from petrobot.coordinator.drawing.scene import RADIUS, Arc, DrawnNode, Scene
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom."""
 
-_BENDS = (0.0, 34.0, -34.0, 68.0, -68.0, 110.0, -110.0, 160.0, -160.0, 220.0, -220.0)
+_BENDS = (0.0, *(b for w in (34.0, 68.0, 110.0, 160.0, 220.0, 340.0, 520.0) for b in (w, -w)))
 """Candidates for the bend of an arc, the straight line first (drawing units)."""
 _CLEARANCE = 7.0
 """Distance that an arc keeps from the border of a node."""
 _SAMPLES = 24
-"""Points on an arc that are tested for collisions."""
+"""Least number of points on an arc that are tested for collisions."""
+_STEP = 10.0
+"""Distance of those points on a long arc: with its clearance a bar is wider, so none is missed."""
 _LEVEL = 36.0
 """How far an arc may run level on both sides of a path point."""
 _AROUND = 80.0
@@ -66,9 +68,11 @@ class ArcPath:
     @property
     def points(self) -> list[Point]:
         """Points along the curve, close enough to detect the nodes that it crosses."""
-        n = _SAMPLES + 8 * (len(self.controls) - 1)
-        pieces = self.pieces()
-        return [_point(pieces, i / n) for i in range(n + 1)]
+        pieces, found = self.pieces(), [self.start]
+        for piece in pieces:  # a piece may be as long as all the others together
+            n = ceil(max(_SAMPLES / len(pieces), 8.0, sum(starmap(dist, pairwise(piece))) / _STEP))
+            found += [_point([piece], i / n) for i in range(1, n + 1)]
+        return found
 
 
 def _point(pieces: Sequence[tuple[Point, Point, Point]], s: float) -> Point:

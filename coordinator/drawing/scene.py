@@ -483,7 +483,7 @@ def event_lines(task: Task, t: Transition) -> tuple[str, ...]:
     lines: list[str] = []
     for name in t.events:
         lines.append(f"{'ext' if task.events[name].scope is Scope.EXTERNAL else 'int'} {name}")
-    words = t.label or t.name.replace("_", " ")
+    words = t.label or t.name
     ends = any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs)
     if t.after is not None:
         lines.append(f"{words}: after {t.after:g} s")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from petrobot.coordinator.task import (
@@ -16,15 +17,18 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
+from petrobot.coordinator.task.expansion import with_error_branches
 
 
 def picture(task: Task) -> dict[str, Any]:
     """Return the snapshot's `task`: the flat net (with the names used in markings and firings) and
     its macro places. `made_from` of an element names the short form that it was made from, which is
-    drawn instead."""
+    drawn instead. An exit that `[errors]` adds has none: it is drawn, as `petrobot show` does it.
+    Conditions are those of the file, without what short forms add to them."""
     flat = task.flat
     errors = flat.error_elements
     macros = dict(_macros(task, task.places, ""))
+    written = dict(_written(task, ""))
     return {
         "name": task.name,
         "text": task.text,
@@ -40,7 +44,10 @@ def picture(task: Task) -> dict[str, Any]:
                 for name, (p, around) in macros.items()
             ),
         ],
-        "transitions": [_transition(t, flat, t.name in errors) for t in flat.transitions.values()],
+        "transitions": [
+            _transition(t, written.get(t.name) or _made(t, written), flat, t.name in errors)
+            for t in flat.transitions.values()
+        ],
         "arcs": [arc for t in flat.transitions.values() for arc in _arcs(t)],
     }
 
@@ -57,6 +64,29 @@ def _macros(
                 yield from _macros(
                     task, task.subnets[place.subnet].places, f"{prefix}{place.name}."
                 )
+
+
+def _written(net: Task, prefix: str) -> Iterator[tuple[str, Transition]]:
+    """Return each transition of the file, and each exit that `[errors]` adds, by its full name."""
+    net = with_error_branches(net)
+    for t in net.transitions.values():
+        yield prefix + t.name, replace(t, expanded_from="")
+    for place in net.places.values():
+        if place.subnet:
+            subnet = net.subnets[place.subnet]
+            inner = replace(
+                net,
+                places=subnet.places,
+                transitions=subnet.transitions,
+                errors_to=subnet.errors_to,
+            )
+            yield from _written(inner, f"{prefix}{place.name}.")
+
+
+def _made(t: Transition, written: Mapping[str, Transition]) -> Transition:
+    """Return a transition that a short form adds; a copy (`seen.1`) was made from its original."""
+    origin, _, _ = t.name.rpartition(".")
+    return replace(t, expanded_from=origin) if origin in written else t
 
 
 def _place(place: Place, error: bool) -> dict[str, Any]:
@@ -80,16 +110,18 @@ def _place(place: Place, error: bool) -> dict[str, Any]:
     }
 
 
-def _transition(transition: Transition, task: Task, error: bool) -> dict[str, Any]:
+def _transition(
+    transition: Transition, written: Transition, task: Task, error: bool
+) -> dict[str, Any]:
     return {
         "name": transition.name,
         "label": transition.label,
         "in_macro": transition.macro,
-        "made_from": transition.expanded_from,
+        "made_from": written.expanded_from,
         "x": transition.x,
         "y": transition.y,
         "events": [_event_words(e, task) for e in transition.events],
-        "when": str(transition.when) if transition.when is not None else "",
+        "when": str(written.when) if written.when is not None else "",
         "priority": transition.priority,
         "weight": transition.weight,
         "after": transition.after,

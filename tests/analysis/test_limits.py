@@ -23,10 +23,14 @@ from petrobot.coordinator.analysis.execution.graph import execute
 from petrobot.coordinator.analysis.formats import tree
 from petrobot.coordinator.analysis.formats.netfile import NetFile
 from petrobot.coordinator.analysis.formats.pnml import write_pnml
-from petrobot.coordinator.analysis.limits import until
+from petrobot.coordinator.analysis.limits import OutOfTime, until
+from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
 from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
-from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.report import LATE
+from petrobot.coordinator.analysis.time import task_forecast
+from petrobot.coordinator.analysis.time.completion import CompletionTime, completion_time
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.cli import loading
 from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
@@ -86,6 +90,31 @@ def test_a_what_if_tells_its_verdicts_whenever_the_time_is_used_up(
     assert "error" not in outcome.data and outcome.data["verdicts"]["bounded"]["holds"]
     assert outcome.data["as_it_is"]["verdicts"]["bounded"]["holds"]
     assert "what if parts=2:" in outcome.text
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_distribution_of_times_is_computed_once_and_its_lack_costs_no_other_number(
+    late: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes longer than all the rest together, so it may come too late."""
+    path, computed = tmp_path / "task.toml", list[float]()
+    path.write_text(GRIPS, encoding="utf-8")
+
+    def counted(chain: Chain, goal: Mask) -> CompletionTime:
+        if late:
+            raise OutOfTime("distribution of the completion time: unknown within the time limit")
+        computed.append(0.0)
+        return completion_time(chain, goal)
+
+    monkeypatch.setattr(task_forecast, "completion_time", counted)
+    changes = ["grip.error.share=0.05"]
+    measures = ["p95=time(0.95)", "p80=time(0.8)"] if not late else []
+    outcome = analyse_command(path, view="gspn", changes=changes, measures=measures)
+    _, _, table = outcome.text.partition("what if grip.error.share=0.05:")
+    assert outcome.data["forecast"]["mean"] == pytest.approx(3 / 0.95)
+    assert "mean" in table and ("90 % quantile" in table) is not late
+    assert outcome.text.count("the time was used up") == outcome.data["notes"].count(LATE) == late
+    assert len(computed) == (0 if late else 2)  # of each file once, not for each number again
 
 
 GRIPS = """schema = 1

@@ -265,7 +265,7 @@ def test_simulation_and_solution_of_the_catching_task_agree() -> None:
     mean, low, high = seen.data["time"]
     assert low - (high - low) < exact.done.mean < high + (high - low)
     assert seen.data["quantiles"]["0.9"] == pytest.approx(
-        exact.completion_time().quantile(0.9), rel=0.1
+        exact.completion_time.quantile(0.9), rel=0.1
     )
     fewer = simulate_command(
         CATCH, np.random.default_rng(5), replicas=200, stages=3, changes=["runs=1"]

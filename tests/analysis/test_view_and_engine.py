@@ -655,7 +655,7 @@ lost = { in = ["work:error"], out = ["ready"] }
         assert found.one_trial.done.mean == pytest.approx(1.5)
         # (exp(-t / 2) + exp(-t)) / 2 = 0.1
         late = -2 * log((sqrt(1.8) - 1) / 2)
-        assert found.one_trial.completion_time().quantile(0.9) == pytest.approx(late)
+        assert found.one_trial.completion_time.quantile(0.9) == pytest.approx(late)
 
 
 def test_a_figure_that_the_execution_graph_contradicts_is_doubtful() -> None:

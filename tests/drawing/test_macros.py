@@ -215,3 +215,50 @@ def test_a_marking_in_words_shows_tries_only_when_they_have_counted() -> None:
     used = list(net.initial)
     used[net.place_index["own.left"]], used[net.place_index["own.used"]] = 0, 1
     assert net.describe(tuple(used)) == "begin own.left:0 own.used"
+
+
+def test_the_page_draws_what_errors_adds_and_no_condition_that_the_file_lacks() -> None:
+    """The same as `show --errors`: an exit that `[errors]` adds is drawn, its copies are not."""
+    made = {t["name"]: t for t in picture(loads(ADDED_EXITS))["transitions"]}
+    drawn = {name for name, t in made.items() if not t["made_from"]}
+    written = {"look", "seen", "go_home", "home", "stranded", "fetch.arrived"}
+    assert drawn == written | {"fetch.drive.error", "fetch.error", "read.error"}
+    assert not any(made[name]["when"] for name in drawn)
+    assert made["read.error.1"]["made_from"] == "read.error"
+    assert made["seen.1"]["made_from"] == "seen" and made["read.retry"]["made_from"] == "read"
+
+
+ADDED_EXITS = """schema = 1
+[task]
+name = "exits"
+final = "hurt == 0"
+[errors]
+to = "hurt"
+[primitive_tasks]
+drive = { deadline = 9.0 }
+read = { deadline = 3.0 }
+park = { deadline = 20.0 }
+[places]
+fetch = { kind = "macro", subnet = "go" }
+read = { kind = "action", tries = 2 }
+hurt = {}
+park = { kind = "action", tries = 2 }
+[transitions]
+look = { in = ["fetch:normal"], out = ["read"] }
+seen = { in = ["read:normal"] }
+go_home = { in = ["hurt"], out = ["park"] }
+home = { in = ["park:normal"] }
+stranded = { in = ["park:error"] }
+[subnets.go]
+entry = "drive"
+normal = "there"
+error = "failed"
+[subnets.go.errors]
+to = "failed"
+[subnets.go.places]
+drive = { kind = "action" }
+there = {}
+failed = {}
+[subnets.go.transitions]
+arrived = { in = ["drive:normal"], out = ["there"] }
+"""

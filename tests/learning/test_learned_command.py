@@ -321,6 +321,20 @@ def test_show_lists_the_worst_case_and_each_context(
     assert "hard" not in text
 
 
+def test_no_action_is_recommended_for_a_target_that_none_is_known_to_meet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two successes of two show no R of 0.9; sixty of sixty do."""
+    few = file_of(tmp_path / "few.db", good=shares(1.0, any=(2, 0)))
+    shown, text = told(few, capsys, "--target", "0.9")
+    assert shown["pick"]["to_reach"] is None and "good meets R 0.9 in: none" in text
+    assert "R 0.9 is met by no action so far" in text and "costs least" not in text
+    many = file_of(tmp_path / "many.db", good=shares(1.0, any=(60, 0)))
+    shown, text = told(many, capsys, "--target", "0.9", "--budget", "0.5")
+    assert shown["pick"]["to_reach"]["action"] == "good"
+    assert "R 0.9 costs least with good" in text and "cost 0.5 buys nothing known" in text
+
+
 def test_show_uses_the_target_stored_in_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

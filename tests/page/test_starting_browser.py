@@ -105,7 +105,7 @@ async def test_every_option_of_the_command_line(
     await expect(mission(tab)).to_contain_text("Success")
     await expect(mission(tab)).to_contain_text("simulated")
     result = tab.get_by_role("status").filter(has_text="reached its final marking")
-    await expect(result).to_have_text(re.compile(r"mission time\d+(\.\d+)? s"))
+    await expect(result).to_have_text(re.compile(r"took\d+(\.\d+)? s"))
     await expect(result.get_by_text("reason")).to_have_count(0)  # it is above, as a sentence
     [folder] = cell.runs.iterdir()
     header = read_journal(folder / JOURNAL).header

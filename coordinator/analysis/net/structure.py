@@ -9,7 +9,7 @@ sections V to VII.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import gcd, lcm
@@ -138,18 +138,36 @@ def _minimal_supports(
     """
     old = [(sum(1 << i for i in row[0]), row) for row in kept]
     new: list[tuple[int, tuple[Vector, Vector]]] = []
+    smaller = _supports(mask for mask, _ in old)
     for mask, row in sorted(
         ((sum(1 << i for i in row[0]), row) for row in fresh), key=lambda one: one[0].bit_count()
     ):
         if overtime():
             return None
-        if not any(mask & other == other for other, _ in new) and not any(
-            mask & other == other for other, _ in old
-        ):
+        if not _contains_one(row[0], mask, smaller):
             new.append((mask, row))
-    return [row for mask, row in old if not any(mask & other == other for other, _ in new)] + [
+            smaller.setdefault(mask & -mask, []).append(mask)
+    added = _supports(mask for mask, _ in new)
+    return [row for mask, row in old if not _contains_one(row[0], mask, added)] + [
         row for _, row in new
     ]
+
+
+def _supports(masks: Iterable[int]) -> dict[int, list[int]]:
+    """Return the supports by their lowest bit: only those of its own bits can lie within another
+    support, a small part of all where the supports are small."""
+    found = dict[int, list[int]]()
+    for mask in masks:
+        found.setdefault(mask & -mask, []).append(mask)
+    return found
+
+
+def _contains_one(support: Iterable[int], mask: int, supports: dict[int, list[int]]) -> bool:
+    for i in support:
+        for other in supports.get(1 << i, ()):
+            if mask & other == other:
+                return True
+    return False
 
 
 def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:

@@ -61,7 +61,7 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
     }
     if isinstance(found, Forecast):
         calls |= {
-            "time": lambda q: found.completion_time().quantile(_number(measure, q, 1.0)),
+            "time": lambda q: found.completion_time.quantile(_number(measure, q, 1.0)),
             "late": lambda s: _late(found, _number(measure, s, float("inf"))),
         }
         numbers = {
@@ -99,7 +99,7 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
 
 def _late(found: Forecast, seconds: float) -> float:
     share = found.completion_probability
-    return 1.0 - share * found.completion_time().cdf(seconds) if share > 0 else 1.0
+    return 1.0 - share * found.completion_time.cdf(seconds) if share > 0 else 1.0
 
 
 def _fault(measure: Measure, problem: str, remedy: str) -> NetFileError:

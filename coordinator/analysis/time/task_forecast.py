@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.space import SearchLimits
@@ -388,13 +389,22 @@ class Forecast:
         able = (back.h > 0) & ~nominal
         return float(np.max(back.y[able] / back.h[able], initial=0.0))
 
+    @cached_property
     def completion_time(self) -> CompletionTime:
         """Return the distribution of the time to completion."""
         return completion_time(self.chain, self.done.goal)
 
+    def quantiles(self, *shares: float) -> dict[str, float]:
+        """Return quantiles of the completion time (s) by share; none if no run completes, or if
+        the time limit passes before they are known."""
+        try:
+            shape = self.completion_time if shares and self.completion_probability > 0 else None
+        except OutOfTime:
+            shape = None
+        return {f"{q:g}": shape.quantile(q) for q in shares} if shape else {}
+
     def to_json(self, quantiles: tuple[float, ...] = (0.5, 0.9, 0.99)) -> dict[str, Any]:
         """Return plain data. Quantiles need a uniformisation; pass none to save its time."""
-        shape = self.completion_time() if quantiles and self.completion_probability > 0 else None
         return {
             "P_complete": self.completion_probability,
             "P_complete_error": self.completion_error,
@@ -403,7 +413,7 @@ class Forecast:
             "R_conj": self.conjunctive_reliability,
             "mean": self.done.mean,
             "standard_deviation": self.done.variance**0.5,
-            "quantiles": {f"{q:g}": shape.quantile(q) for q in quantiles} if shape else {},
+            "quantiles": self.quantiles(*quantiles),
             "trials": self.trials,
             "one_trial": self.one_trial.told,
             "mission_time": self.mission_time,

@@ -278,7 +278,7 @@ export class Live {
     const facts = Object.entries(result ?? {}).filter(([k, v]) => !said.includes(k) && ["number", "string", "boolean"].includes(typeof v));
     const value = (k, v) => (typeof v !== "number" ? String(v) : k.endsWith("_s") ? seconds(v) : +v.toPrecision(4));
     fill(this.result, h("h2", {}, icon(STATUS_ICON[mission.state] ?? "error"), head), mission.reason ? h("p", {}, mission.reason) : null,
-      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, k === "sim_s" ? "mission time" : words(k.replace(/_s$/, ""))), h("dd", {}, value(k, v))))) : null);
+      facts.length ? h("dl", {}, facts.map(([k, v]) => h("div", {}, h("dt", {}, k === "sim_s" ? "took" : words(k.replace(/_s$/, ""))), h("dd", {}, value(k, v))))) : null);
   }
 
   controlsChanged() {

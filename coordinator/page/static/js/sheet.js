@@ -65,7 +65,7 @@ export function sheetOf(task, inside) {
   const outside = (t) => inside && joined.has(t.name) && !around(macros, t.name).includes(inside);
   const transitions = task.transitions.filter((t) => here(t) || outside(t)).map((t) => (here(t) ? t : { ...t, x: undefined, y: undefined, outside: true }));
   const names = new Set(transitions.map((t) => t.name));
-  const base = (e) => (e.label ? e : { ...e, label: e.outside ? e.name : e.name.startsWith(`${inside}.`) ? e.name.slice(inside.length + 1) : e.name.split(".").at(-1) });
+  const base = (e) => (e.label ? e : { ...e, label: e.outside ? e.name : !inside ? e.name : e.name.startsWith(`${inside}.`) ? e.name.slice(inside.length + 1) : e.name.split(".").at(-1) });
   return placed(onlyErrors({
     places: task.places.filter(here).map((p) => base({ ...p, sub: p.kind === "action" && p.primitive_task !== p.name ? words(p.primitive_task) : "", hint: hintPlace(p) })),
     transitions: transitions.map((t) => base({ ...t, sub: caption(t), hint: hintTransition(t) })),
