@@ -162,7 +162,7 @@ async def test_step_fires_once(petrobot: Terminal) -> None:
 async def test_a_step_of_an_active_run_says_that_it_is_paused_now(petrobot: Terminal) -> None:
     """Who did not pause it would leave the robot standing."""
     stepping = asyncio.create_task(petrobot("step"))
-    await petrobot.until(lambda: petrobot.mission.executor.state.mode is Mode.STEPPING)
+    await until(lambda: petrobot.mission.executor.state.mode is Mode.STEPPING)
     await petrobot("raise", "part_there")
     told = (await stepping).out
     assert "fired start" in told and "the run was not paused, and is now" in told
@@ -259,7 +259,7 @@ async def test_what_no_journal_can_store_is_refused_and_changes_nothing(petrobot
 async def test_watch_shows_tokens_and_events_of_the_operator(petrobot: Terminal) -> None:
     """A command that was refused is not shown."""
     watching = asyncio.create_task(petrobot("watch"))
-    await petrobot.until(lambda: petrobot.operation.feed.watched)
+    await until(lambda: petrobot.operation.feed.watched)
     commands = ["pause", "token jobs +3", "token jobs -1", "token jobs +5", "raise part_there"]
     # All write to one terminal.
     out = [(await petrobot(*command.split())).out for command in (*commands, "abort")]
