@@ -523,8 +523,6 @@ class Runner:
                 run.note(f"while it cleaned up: {describe(fault)}")
         if run.phase is STOPPING and run.over:
             run.phase = SETTLING
-            if not self.held:
-                self._reports += self._outlets.finish(now, run.call.id)
 
     def _hint(self, fault: BaseException) -> str:
         """Return what to do about an attribute that `ctx.device` does not have."""
@@ -560,13 +558,13 @@ class Runner:
     def _finish(self, now: float, run: Execution, result: Outcome) -> None:
         """End the run with its action's result, as soon as it is known that the driver refused none
         of its commands."""
-        self._reports += self._outlets.finish(now, run.call.id)
         if self._refusing is None:
             self._end(now, run, result)
         elif result.status is Status.ERROR:
             text = self._with_refusal(run, result.text)
             self._end(now, run, replace(result, text=text))
         else:
+            self._outlets.close(run.call.id)
             run.phase, run.result, run.ready_at = TAKING, result, now + TAKEN_WITHIN
             self._await_taking(now, run)
 

@@ -98,8 +98,6 @@ class _Outlet:
     began: float = 0.0
     values: tuple[float, ...] = ()
     published: float = 0.0
-    sent: bool = False
-    """Whether these values were sent."""
     next: float = -math.inf
     """Earliest time of the next send."""
 
@@ -142,7 +140,7 @@ class Outlets:
         if stream not in self._open:
             outlet.next = max(outlet.next, now)  # after a pause, missed sends are not made up for
         outlet.run, outlet.began = run, began
-        outlet.values, outlet.published, outlet.sent = numbers, now, False
+        outlet.values, outlet.published = numbers, now
         self._open[stream] = outlet
 
     def withdraw(self, stream: str, run: str | None = None) -> None:
@@ -155,35 +153,18 @@ class Outlets:
         for stream in [s for s, outlet in self._open.items() if outlet.run == run]:
             del self._open[stream]
 
-    def finish(self, now: float, run: str) -> list[Sent]:
-        """Withdraw the set points of a run that returned. Return those that were not sent yet, to
-        be sent before its result: the last one often says that a motion is over."""
-        last = [
-            self._send(now, stream, outlet)
-            for stream, outlet in self._open.items()
-            if outlet.run == run and not outlet.sent
-        ]
-        self.close(run)
-        return last
-
     def advance(self, now: float) -> list[Sent]:
         """Return the set points to send now: at most one per stream and period, new or repeated."""
         sent = []
         for stream, outlet in self._open.items():
             if now + SLACK < outlet.next:
                 continue
-            sent.append(self._send(now, stream, outlet))
-        return sent
-
-    @staticmethod
-    def _send(now: float, stream: str, outlet: _Outlet) -> Sent:
-        late = now - outlet.next
-        if late + SLACK >= 0.0:  # the last value of a run is early, and delays no later one
+            late = now - outlet.next
             # absolute times keep the rate; after a gap of more than a period the grid starts again
             outlet.next = (outlet.next if late < outlet.period else now) + outlet.period
-        outlet.sent = True
-        elapsed, age = max(0.0, now - outlet.published), max(0.0, now - outlet.began)
-        return Sent(outlet.run, stream, outlet.values, elapsed, age)
+            elapsed, age = max(0.0, now - outlet.published), max(0.0, now - outlet.began)
+            sent.append(Sent(outlet.run, stream, outlet.values, elapsed, age))
+        return sent
 
     def due(self) -> float | None:
         """Return when `advance` has something to send next (s), None if no stream is open."""

@@ -571,67 +571,6 @@ def test_set_points_are_paced_repeated_and_end_with_their_run(bench: Make) -> No
     assert len(last) in (3, 4) and max(last) <= b.ended(run).seconds + 1e-9
 
 
-async def _returns(ctx: Context) -> Result:
-    return success()
-
-
-async def _reports_an_error(ctx: Context) -> Result:
-    return error("slip", "the wheels slipped")
-
-
-async def _is_cancelled(ctx: Context) -> Result:
-    await ctx.sleep(1.0)
-    return success()
-
-
-@pytest.mark.parametrize("rest", [_returns, _reports_an_error, _is_cancelled])
-def test_the_last_set_point_of_a_run_is_sent_before_its_result(
-    bench: Make, rest: Callable[[Context], Any]
-) -> None:
-    async def streams(ctx: Context) -> Result:
-        try:
-            ctx.publish("points", [1.0])
-            await ctx.sleep(TICK)
-            return await rest(ctx)  # type: ignore[no-any-return]
-        finally:
-            ctx.publish("points", [0.0])
-
-    b = bench(act=streams)
-    run = b.begin("act")
-    told = b.tick()
-    b.clock.now += TICK
-    told += b.tick()
-    if rest is _is_cancelled:
-        b.runner.take(b.clock.now, Cancel(run, "preempted"))
-    told += b.tick()
-    assert [r.values if isinstance(r, Sent) else type(r) for r in told] == [
-        (1.0,),
-        (0.0,),
-        Outcome,
-    ]
-
-
-def test_what_was_not_sent_when_a_run_was_cancelled_or_raised_is_dropped(bench: Make) -> None:
-    async def streams(ctx: Context, *, raises: bool) -> Result:
-        ctx.publish("points", [1.0])
-        await ctx.sleep(TICK)
-        ctx.publish("points", [2.0])
-        if raises:
-            raise RuntimeError("a fault")
-        await ctx.sleep(1.0)
-        return success()
-
-    for raises in (False, True):
-        b = bench(act=streams)
-        run = b.begin("act", raises=raises)
-        told = b.tick()
-        b.clock.now += TICK
-        told += b.tick()
-        b.runner.take(b.clock.now, Cancel(run, "preempted"))
-        told += b.tick()
-        assert [r.values for r in told if isinstance(r, Sent)] == [(1.0,)]
-
-
 @pytest.mark.parametrize(
     ("stream", "values"), [("nowhere", [1.0]), ("points", [float("nan")]), ("points", ["x"])]
 )
