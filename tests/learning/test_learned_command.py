@@ -17,7 +17,9 @@ from petrobot.coordinator.learning.estimates_file import EstimatesError, Estimat
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.session import LearningSession, LearningSetting, session_of
+from petrobot.coordinator.operator.session import LockstepSession
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.mission import MissionError
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Status
 from tests.learning.cell import HEAD, TASK_FILE, directory, run, sorting
@@ -701,3 +703,20 @@ def test_the_gate_says_what_a_target_needs(cell: Path, capsys: pytest.CaptureFix
     assert shown["pick"]["target_unmet"]
     for row in shown["pick"]["actions"]:
         assert row["J_low"] <= row["J"] < row["J_high"]
+
+
+def test_estimates_that_cannot_be_saved_do_not_hide_why_the_run_failed(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = cell / "learned.db"
+
+    async def lead(session: LockstepSession, watch: object) -> None:
+        path.mkdir()  # the estimates file is replaced during the run
+        raise MissionError("the camera is gone")
+
+    monkeypatch.setattr(LockstepSession, "_lead", lead)
+    given = ["--mode", "lockstep", "--mock", "mock.toml", "--quiet", "--learn", str(path)]
+    assert main(["run", str(TASK_FILE), *given]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1] == "petrobot run: the camera is gone", said
+    assert any("what it learned is not saved" in line and str(path) in line for line in said), said
