@@ -231,7 +231,7 @@ class RunSession(ABC):
         """Save what it learned, also after an interruption; return the part of the result about
         it."""
         make_folder(session.setting.path.parent)
-        counted = session.save(interrupted=self.mission.stage is not Stage.OVER)
+        counted = session.save()
         learning, values = session.learning, session.selector.context
         for name, action, measure in learning.uncosted():
             _log.warning(

@@ -522,7 +522,7 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     for record in one.selector.records[:half]:
         interrupted.selector.records.append(record)
         interrupted.learning.apply(record)
-    interrupted.save(interrupted=True)
+    interrupted.save()
     resumed = session_of(task, header)
     assert resumed is not None
     for record in one.selector.records:
@@ -720,3 +720,27 @@ def test_estimates_that_cannot_be_saved_do_not_hide_why_the_run_failed(
     said = capsys.readouterr().err.splitlines()
     assert said[-1] == "petrobot run: the camera is gone", said
     assert any("what it learned is not saved" in line and str(path) in line for line in said), said
+
+
+def test_a_run_that_ended_without_its_result_counts_once(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coordinator dies between the estimates and the result: the resume that gives the result
+    adds nothing, and leaves what others have learned since then."""
+
+    def die(session: LockstepSession) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LockstepSession, "keep_result", die)
+        given = ["--mode", "lockstep", "--mock", "mock.toml", "--quiet", "--journal", "runs"]
+        assert main(["run", str(TASK_FILE), *given, "--learn", "learned.db"]) == 2
+    once = EstimatesFile(cell / "learned.db").read()
+    assert petrobot("--learn", "learned.db")[0] == 0
+    both = EstimatesFile(cell / "learned.db").read()
+    assert main(["resume", "last", "--quiet", "--json", "again.json"]) == 0
+    again = EstimatesFile(cell / "learned.db").read()
+    assert once.estimates.tallies and again.estimates.tallies == both.estimates.tallies
+    assert again.selectors == both.selectors and again.generation == both.generation == 2
+    counted = json.loads(Path("again.json").read_text(encoding="utf-8"))["learned"]["runs_counted"]
+    assert counted == sum(t.runs + t.censored for t in once.estimates.tallies.values())
