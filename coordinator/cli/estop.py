@@ -135,7 +135,9 @@ def _show(
         print("no node of this cell has devices: nothing to stop")
     for answer in answers:
         for device, said in answer.devices.items():
-            print(f"{answer.node:12} {device:12} {said}")
+            # The node has cleared the stop; `said` is what the device's process does.
+            late = options.clear and said != "cleared"
+            print(f"{answer.node:12} {device:12} {f'cleared ({said})' if late else said}")
         if not answer.answered and not answer.cleared:
             print(f"{answer.node:12} {'':12} NO ANSWER: {answer.why}")
         if answer.open and not options.clear:

@@ -228,12 +228,12 @@ class EstimatesFile:
         selectors (primitive task -> state).
 
         `mission`, `records`: remember that so many records of a mission run are counted, so that
-        none counts twice when it is resumed; None: the run finished, nothing to remember. `late`:
-        verdicts on runs that this file counted before; sums that were reset since then, or came
-        from a copied file, stay as they are. `asked`: by what actions were judged (primitive task
-        -> question). `physics`: of the simulated laboratory. `plant`: where the runs took place.
-        `prior`: the plant whose estimates its learners started from, and how many trials they
-        counted. Raises EstimatesError, also if the file was learned with another physics.
+        none counts twice when it is resumed; None: it cannot be. `late`: verdicts on runs that
+        this file counted before; sums that were reset since then, or came from a copied file, stay
+        as they are. `asked`: by what actions were judged (primitive task -> question). `physics`:
+        of the simulated laboratory. `plant`: where the runs took place. `prior`: the plant whose
+        estimates its learners started from, and how many trials they counted. Raises
+        EstimatesError, also if the file was learned with another physics.
         """
         with self._writing() as db:
             self._note_physics(db, physics, plant)
@@ -257,12 +257,11 @@ class EstimatesFile:
                     (origin, task),
                 )
                 put_question(db, origin, task, question, (row.fetchone() or (0,))[0] + 1)
-            count_session(db)
-            db.execute("DELETE FROM mission WHERE id = ?", (mission,))
-            db.execute("DELETE FROM about WHERE name = ?", (COUNTED + mission,))
+            if not db.execute("SELECT 1 FROM mission WHERE id = ?", (mission,)).fetchone():
+                count_session(db)
             if records is not None:
-                db.execute("INSERT INTO mission VALUES (?, ?)", (mission, records))
-                db.execute("INSERT INTO about VALUES (?, ?)", (COUNTED + mission, origin))
+                db.execute("INSERT OR REPLACE INTO mission VALUES (?, ?)", (mission, records))
+                put_fact(db, COUNTED + mission, origin)
 
     def put_closed(
         self,

@@ -162,29 +162,29 @@ class LearningSession:
         begun = {"token": self._token, "generation": self._generation, "selectors": self._begun}
         return {**self.setting.to_plain(), **begun}
 
-    def save(self, *, interrupted: bool = False) -> int:
-        """Add what was learned to the file and return the number of counted runs.
+    def save(self) -> int:
+        """Add what was learned to the file, and return how many of its runs the file has counted.
 
-        `interrupted`: the mission run may be resumed; what is saved now will not be counted a
-        second time then.
+        Nothing is added twice: the mission run may be resumed, even a finished one whose
+        coordinator died before it wrote its result.
         """
         if self.setting.frozen:
             return 0
-        done = self.file.records_of(self._token)
+        done, records = self.file.records_of(self._token), len(self.selector.records)
         gained, late = (self.learning.gained, ()) if not done else self._gained_after(done)
-        counted = len(self.selector.records) if interrupted else None
-        self.file.add(
-            gained,
-            self.learning.state(),
-            self._token,
-            counted,
-            late,
-            self.learning.asked(),
-            self.setting.physics,
-            self.setting.plant,
-            self._prior,
-        )
-        return sum(t.runs + t.censored for t in gained.tallies.values())
+        if not done or done < records:
+            self.file.add(
+                gained,
+                self.learning.state(),
+                self._token,
+                records,
+                late,
+                self.learning.asked(),
+                self.setting.physics,
+                self.setting.plant,
+                self._prior,
+            )
+        return sum(t.runs + t.censored for t in self.learning.gained.tallies.values())
 
     def _gained_after(self, done: int) -> tuple[Estimates, Sequence[Correction]]:
         """Return what was learned after so many records, and the verdicts among them on runs that

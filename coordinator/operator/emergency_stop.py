@@ -34,10 +34,11 @@ from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
 
 STOP = EMERGENCY_STOP
 CLEAR = "clear_emergency"
-_DONE = {STOP: ("stopped",), CLEAR: ("cleared", "not ready")}
-"""By order: the answers of a device that has carried it out. One that is not ready is not known to
-stand still; once cleared, it starts without a stop."""
 _SILENT = "no answer"
+_DONE = {STOP: ("stopped",), CLEAR: ("cleared", "not ready", _SILENT)}
+"""By order: the answers of a device that has carried it out. One that is not ready or does not
+answer is not known to stand still; but its node has cleared the stop before it answers, so it
+continues or starts without one."""
 NODE_LATE = 0.15
 """Wait for a node's answer before its bus is stopped instead (s)."""
 STANDSTILL = 1.5

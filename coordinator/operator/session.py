@@ -28,6 +28,7 @@ from typing import Any, ClassVar, Final
 
 from petrobot.coordinator.engine import Mode, Override, SetBreakpoints, Stimulus
 from petrobot.coordinator.launch import local_nodes
+from petrobot.coordinator.learning.estimates_file import EstimatesError
 from petrobot.coordinator.learning.session import LearningSession
 from petrobot.coordinator.operator.commands import Operation, Shown
 from petrobot.coordinator.operator.observation import Shell
@@ -140,6 +141,7 @@ class RunSession(ABC):
         """
         self._led = True
         _log.info("run %s: started (%s, task %s)", self.identity, self.mode, self._task.name)
+        stopped_by: BaseException | None = None
         try:
             with ExitStack() as until_ended:
                 if self.folder is not None and self.address is not None:
@@ -151,6 +153,7 @@ class RunSession(ABC):
                         raise
                     self._go_unscored(fault)
         except BaseException as fault:
+            stopped_by = fault
             _log.info("run %s: stopped by %s: %s", self.identity, type(fault).__name__, fault)
             raise
         finally:
@@ -158,9 +161,15 @@ class RunSession(ABC):
                 await self.operation.close()
             await self._leave()
             self._close_journal()
-            if self._learning is not None:
-                self._learned = self._saved(self._learning)
             self._seconds = time.perf_counter() - self._begun
+            if self._learning is not None:
+                try:
+                    self._learned = self._saved(self._learning)
+                except (EstimatesError, OSError) as fault:
+                    if stopped_by is None:
+                        raise
+                    # What stopped the run is what the caller must hear: a full disk is both.
+                    _log.error("run %s: what it learned is not saved: %s", self.identity, fault)
         _log.info("run %s: finished, %s", self.identity, self.result()["status"])
 
     async def abandon(self) -> None:
@@ -222,7 +231,7 @@ class RunSession(ABC):
         """Save what it learned, also after an interruption; return the part of the result about
         it."""
         make_folder(session.setting.path.parent)
-        counted = session.save(interrupted=self.mission.stage is not Stage.OVER)
+        counted = session.save()
         learning, values = session.learning, session.selector.context
         for name, action, measure in learning.uncosted():
             _log.warning(

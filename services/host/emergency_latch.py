@@ -94,7 +94,8 @@ class Latch:
         """Allow these devices to move again; `ALL` means `all_devices`. Raises
         LatchError, and then nothing is cleared."""
         stopped = self.stopped()
-        named = set(all_devices) if ALL in stopped else set(stopped)
+        # A name that is none of them means all: `ALL`, or a device that was renamed while stopped.
+        named = set(stopped) if stopped <= set(all_devices) else set(all_devices)
         left = named - set(devices)
         if stopped:  # Counted first: a stop that is not counted must not be cleared.
             before = self.cleared

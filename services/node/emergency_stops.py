@@ -114,7 +114,9 @@ class EmergencyStops:
         cleared = self._latch.cleared  # before the devices: that is the order of clearing
         self._count(cleared)
         stopped = self._latch.stopped()
-        on_disk = [d for d in self._devices if d in stopped or ALL in stopped]
+        # A name that this node does not have means all: `ALL`, or a device renamed while stopped.
+        unknown = not stopped <= set(self._devices)
+        on_disk = [d for d in self._devices if d in stopped or unknown]
         last = cleared.devices
         freed = [d for d, n in self._counted.items() if last.get(d, 0) > n and d not in on_disk]
         self._stopped.difference_update(freed)

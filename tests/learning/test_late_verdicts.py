@@ -76,7 +76,7 @@ def test_wherever_it_was_interrupted_each_verdict_counts_once(task: Task, tmp_pa
     for done in range(1, len(records) + 1):
         path = tmp_path / f"{done}.db"
         first = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
-        taken_up(task, first, records[:done]).save(interrupted=True)
+        taken_up(task, first, records[:done]).save()
         resumed = taken_up(task, first, records)
         resumed.save()
         assert kept(path) == TRUE, f"interrupted after {done} of {len(records)} records"
@@ -90,7 +90,7 @@ def split(task: Task, path: Path, between: Callable[[], None]) -> None:
     records = whole(task, path.with_name("none.db")).selector.records
     last = max(n for n, r in enumerate(records) if isinstance(r, Correction))
     first = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
-    taken_up(task, first, records[:last]).save(interrupted=True)
+    taken_up(task, first, records[:last]).save()
     between()
     taken_up(task, first, records).save()
 

@@ -17,7 +17,9 @@ from petrobot.coordinator.learning.estimates_file import EstimatesError, Estimat
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.session import LearningSession, LearningSetting, session_of
+from petrobot.coordinator.operator.session import LockstepSession
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.mission import MissionError
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Status
 from tests.learning.cell import HEAD, TASK_FILE, directory, run, sorting
@@ -534,7 +536,7 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     for record in one.selector.records[:half]:
         interrupted.selector.records.append(record)
         interrupted.learning.apply(record)
-    interrupted.save(interrupted=True)
+    interrupted.save()
     resumed = session_of(task, header)
     assert resumed is not None
     for record in one.selector.records:
@@ -715,3 +717,44 @@ def test_the_gate_says_what_a_target_needs(cell: Path, capsys: pytest.CaptureFix
     assert shown["pick"]["target_unmet"]
     for row in shown["pick"]["actions"]:
         assert row["J_low"] <= row["J"] < row["J_high"]
+
+
+def test_estimates_that_cannot_be_saved_do_not_hide_why_the_run_failed(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = cell / "learned.db"
+
+    async def lead(session: LockstepSession, watch: object) -> None:
+        path.mkdir()  # the estimates file is replaced during the run
+        raise MissionError("the camera is gone")
+
+    monkeypatch.setattr(LockstepSession, "_lead", lead)
+    given = ["--mode", "lockstep", "--mock", "mock.toml", "--quiet", "--learn", str(path)]
+    assert main(["run", str(TASK_FILE), *given]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1] == "petrobot run: the camera is gone", said
+    assert any("what it learned is not saved" in line and str(path) in line for line in said), said
+
+
+def test_a_run_that_ended_without_its_result_counts_once(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coordinator dies between the estimates and the result: the resume that gives the result
+    adds nothing, and leaves what others have learned since then."""
+
+    def die(session: LockstepSession) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LockstepSession, "keep_result", die)
+        given = ["--mode", "lockstep", "--mock", "mock.toml", "--quiet", "--journal", "runs"]
+        assert main(["run", str(TASK_FILE), *given, "--learn", "learned.db"]) == 2
+    once = EstimatesFile(cell / "learned.db").read()
+    assert petrobot("--learn", "learned.db")[0] == 0
+    both = EstimatesFile(cell / "learned.db").read()
+    assert main(["resume", "last", "--quiet", "--json", "again.json"]) == 0
+    again = EstimatesFile(cell / "learned.db").read()
+    assert once.estimates.tallies and again.estimates.tallies == both.estimates.tallies
+    assert again.selectors == both.selectors and again.generation == both.generation == 2
+    counted = json.loads(Path("again.json").read_text(encoding="utf-8"))["learned"]["runs_counted"]
+    assert counted == sum(t.runs + t.censored for t in once.estimates.tallies.values())

@@ -352,3 +352,30 @@ async def test_a_stop_of_a_frozen_node_is_cleared_for_its_driver_too(tmp_path: P
         assert moved.status == "success", moved
     finally:
         nodes.stop()
+
+
+async def test_a_stop_of_a_frozen_driver_is_cleared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its node clears the stop, so nothing is left to do: exit code 0, and the device accepts
+    orders as soon as its process continues."""
+    nodes = Nodes(tmp_path, "left", "right")
+    command = ["estop", "--services", str(nodes.file), "--journal", str(tmp_path)]
+    try:
+        async with operator_of(nodes.directory, "left") as operator:
+            drivers = (await pids(operator, "left", "slide")).values()
+        assert await asyncio.to_thread(main, command) == 0
+        for pid in drivers:
+            os.kill(pid, signal.SIGSTOP)
+        capsys.readouterr()
+        assert await asyncio.to_thread(main, [*command, "--clear"]) == 0
+        assert "left         slide        cleared (no answer)" in capsys.readouterr().out
+        for pid in drivers:
+            os.kill(pid, signal.SIGCONT)
+        async with operator_of(nodes.directory, "left") as operator:
+            limit = Limit("the driver to know of the clearing")
+            while (moved := await operator.call("go", to=0.1)).cause and limit.left():
+                await beat(0.05)
+        assert moved.status == "success", moved
+    finally:
+        nodes.stop()

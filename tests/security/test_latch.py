@@ -214,3 +214,14 @@ def test_a_stop_that_cannot_be_counted_is_not_cleared(tmp_path: Path) -> None:
     with pytest.raises(LatchError, match=r"motion\.cleared: Is a directory"):
         latch(tmp_path).clear(DEVICES, DEVICES)
     assert latch(tmp_path).stopped() == {"arm"}
+
+
+def test_a_device_that_is_renamed_while_it_is_stopped_stays_stopped(tmp_path: Path) -> None:
+    """A name that the node does not have means all its devices, until they are cleared."""
+    EmergencyStops(["arm", "eye"], latch(tmp_path)).stop(["arm"])
+    renamed = EmergencyStops(["puma", "eye"], latch(tmp_path))
+    assert sorted(renamed.at_start()) == ["eye", "puma"]
+    assert renamed.clear(["eye"]) == "" and renamed.names == ("puma",)
+    assert latch(tmp_path).stopped() == {"puma"}, "known by its new name from now on"
+    assert renamed.clear(["puma"]) == "" and latch(tmp_path).stopped() == frozenset()
+    assert EmergencyStops(["puma", "eye"], latch(tmp_path)).at_start() == []
