@@ -101,6 +101,7 @@ def check_driver(
     cable: Callable[[bool], None] | None = None,
     positions: Sequence[str] = (),
     simulated: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> DriverCheck:
     """Check a driver. `make` is its class, or makes a new one each time; `make(speed=0.25)` adds
     this key to the device's table, as `lambda **keys: Axis(keys, ports)` does.
@@ -112,13 +113,14 @@ def check_driver(
     where the device is; without them, all numbers that the commands change. `simulated`: time
     passes only between two steps, for a driver whose device is simulated by its steps; the check
     then takes milliseconds. A driver that was made with ports None gets ports with a clock,
-    `random`, `raise_event` and silent streams.
+    `random`, `raise_event` and silent streams. `progress` is told what is tested now: in real time
+    the test takes about 40 times as long as a movement.
     """
     import_module("numpy")  # a first draw must not count as a slow step
     clock: Any = _Clock() if simulated else time
     if isinstance(make, type):
         make = partial(_made, make, clock.monotonic)
-    check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions)
+    check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions, progress)
     try:
         check.rules(commands, seconds, cable)
         if isinstance(clock, _Clock):
@@ -157,6 +159,7 @@ def check_device(
     seconds: float = 5.0,
     within: float = 1.0,
     positions: Sequence[str] = (),
+    progress: Callable[[str], None] = lambda _: None,
 ) -> DriverCheck:
     """Check the driver of a device of a location file, in this process and in real time. Raises
     ValueError when there is none, or when it cannot be made."""
@@ -176,7 +179,13 @@ def check_device(
         return driver
 
     return check_driver(
-        make, commands, first=first, seconds=seconds, within=within, positions=positions
+        make,
+        commands,
+        first=first,
+        seconds=seconds,
+        within=within,
+        positions=positions,
+        progress=progress,
     )
 
 
@@ -214,8 +223,10 @@ class _Check:
         within: float,
         first: Sequence[Command],
         positions: Sequence[str],
+        progress: Callable[[str], None],
     ) -> None:
         self.make, self.within, self.first, self.positions = make, within, first, positions
+        self.progress = progress
         self.now: Callable[[], float] = clock.monotonic
         self.sleep: Callable[[float], None] = clock.sleep
         self.found = DriverCheck()
@@ -247,6 +258,13 @@ class _Check:
         """The largest step of each position in the last movement."""
         self.start: dict[str, float] = {}
         """The positions at the beginning of the last `way`."""
+        self.measured: tuple[Mapping[str, float], float] = ({}, 0.0)
+        """What the `way` between the first two commands returned."""
+        self.ready = 0.0
+        """The longest time that a new driver needed before it accepted a command (s)."""
+        self.unheld: dict[bool, Command] = {}
+        """The last command whose movement was held short of its end (False), or answered "held" and
+        went on to its end (True)."""
 
     def fault(self, text: str) -> None:
         if text not in self.found.faults:
@@ -350,7 +368,12 @@ class _Check:
             if len(commands) < 2:
                 self.note("stop and hold during a movement: give two commands, there and back")
             else:
-                self.limits(commands, seconds)
+                if len(self.unheld) == 1 and True in self.unheld:  # in every movement
+                    self.fault(
+                        f"hold: answered 'held', and {dict(self.unheld[True])} went on to its end; "
+                        "obey it (`paused`), or if it brakes until then, give longer commands"
+                    )
+                self.limits(commands[0], commands[1], seconds)
         if cable is None:
             self.note("a pulled cable: give `cable`")
         else:
@@ -379,6 +402,7 @@ class _Check:
 
     def again(self, what: str, **keys: Any) -> None:
         """Close the driver and make another one, with further keys."""
+        self.progress(what)
         try:
             self.close()
             self.threads.update(threading.enumerate())  # a library keeps some of its first user
@@ -398,10 +422,12 @@ class _Check:
         """Make one movement to its end, stop one on its way, and hold and release one."""
         self.move(back, seconds, judged=False)
         begin, before = self.numbers(), self.leaves
+        self.progress(f"{dict(back)}, then {dict(there)}")
         positions, took = self.way(there, back, seconds)
         if not positions:
             self.unmoved(there, before)
             return
+        self.measured = self.measured if self.measured[1] else (positions, took)
         far = {n: begin[n] - v for n, v in self.numbers().items() if n in positions.keys() & begin}
         fastest = self.fastest
         self.arrived(there, back, positions, seconds)
@@ -415,7 +441,7 @@ class _Check:
             return
         self.stop("stop during a movement", positions)
         begun()
-        held = self.holds(positions)
+        held = self.holds(back, positions, begin)
         before = self.numbers()
         self.ask(self.driver.release, self.now())
         if held:
@@ -503,8 +529,12 @@ class _Check:
                     "or raise ValueError (if something was in its way, give another command)"
                 )
 
-    def holds(self, positions: Mapping[str, float]) -> bool:
-        """Hold during a movement. Return whether the driver answered that it is held."""
+    def holds(
+        self, back: Command, positions: Mapping[str, float], end: Mapping[str, float]
+    ) -> bool:
+        """Hold during a movement to `end`. Return whether the driver answered that it is held."""
+        self.progress(f"hold during {dict(back)}")
+        left = _differ(end, self.numbers(), positions, PART)
         answer = self.ask(self.driver.hold, self.now())
         if answer not in ("held", "cannot hold", "stopped"):
             self.fault(f'hold: expected "held", "cannot hold" or "stopped", got {answer!r}')
@@ -512,6 +542,9 @@ class _Check:
             self.run(self.within)
             if drift := self.drifts(positions):
                 self.fault(f"hold: answered {answer!r}, and {_names(drift)} still changes")
+                return bool(answer == "held")
+        if left and answer == "held":
+            self.unheld[left.isdisjoint(_differ(end, self.numbers(), positions, SLOWEST))] = back
         return bool(answer == "held")
 
     def released(
@@ -566,6 +599,7 @@ class _Check:
     ) -> None:
         """Give a command during the movement of another one: it is refused or obeyed. `far`: how
         far `back` moves it."""
+        self.progress(f"{dict(there)} during {dict(back)}")
         self.move(there, seconds, judged=False)
         begin = self.numbers()
         self.move(back, PART * took, judged=False)
@@ -586,7 +620,7 @@ class _Check:
                 "before; obey it, or raise ValueError"
             )
 
-    def limits(self, commands: Sequence[Command], seconds: float) -> None:
+    def limits(self, there: Command, back: Command, seconds: float) -> None:
         """Check that it obeys those of `speed`, `workspace` and `dry_run` that are in its
         `obeys`."""
         own = keys_of(type(self.driver))
@@ -596,9 +630,7 @@ class _Check:
             if obeys:
                 self.note(f"{', '.join(obeys)}: let `make` take keys of the device's table")
             return
-        there, back = commands[0], commands[-1]
-        positions, took = self.way(there, back, seconds)
-        self.move(back, seconds)
+        positions, took = self.measured
         if "speed" in obeys:
             asked = SLOW * self.driver.speed  # its table may have a speed
             self.again(f"speed = {asked:g}", speed=asked)
@@ -610,10 +642,9 @@ class _Check:
                     f"speed = {asked:g}: {dict(there)} moves it at {share:.2f} of its usual speed; "
                     "if the way is too short to reach its usual speed, give commands farther apart"
                 )
-            self.move(back, seconds / SLOW)
         if "workspace" in obeys:
             self.again("a workspace far away", workspace=ELSEWHERE)
-            self.run(seconds)
+            self.run(min(seconds, 2.0 * self.ready))
             for command in (there, back):
                 before = self.numbers()
                 with suppress(ValueError):
@@ -623,8 +654,18 @@ class _Check:
                     self.fault(f"workspace: {dict(command)} moves it far outside: {_names(moved)}")
             self.stop("stop")
         if "dry_run" in obeys:
-            self.again("made again")
-            before = self.numbers()
+            places = list[dict[str, float]]()
+            for command in (there, back):
+                self.again("made again")
+                self.move(command, seconds)
+                self.again("made again")
+                places.append(self.numbers())
+            at_there, before = places
+            if not _differ(at_there, before, positions, PART):
+                self.note(
+                    "dry_run: a driver that is made again does not tell where the device is, so "
+                    "nothing shows whether it moved; look at the device"
+                )
             self.again("dry_run = true", dry_run=True)
             self.move(there, seconds)
             self.again("made again")
@@ -645,8 +686,10 @@ class _Check:
         """Give a command and step for `seconds`, or until the device stands still again; return how
         far each position moved."""
         if self.fresh:  # a new driver may need time
+            begin = self.now()
             for needed in (*self.first, command):
                 self.run(seconds, partial(self.accepts, needed))
+            self.ready = max(self.ready, self.now() - begin)
         else:
             self.accepts(command)
         if self.refusing:
@@ -711,6 +754,7 @@ class _Check:
     ) -> None:
         """Stop it twice, by its stop routine or another one."""
         stop = routine or self.driver.stop
+        self.progress(what)
         self.ask(stop, self.now())
         try:
             self.ask(stop, self.now())

@@ -8,7 +8,9 @@ from __future__ import annotations
 import argparse
 import json
 import socket
-from collections.abc import Mapping
+import sys
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -101,6 +103,15 @@ def _refuse_in_use(directory: Directory, device: str) -> None:
         raise CommandError(2, text)
 
 
+def _progress() -> Callable[[str], None]:
+    begin = time.monotonic()
+
+    def tell(what: str) -> None:
+        print(f"{time.monotonic() - begin:4.0f} s  {what}", file=sys.stderr, flush=True)
+
+    return tell
+
+
 def run(options: argparse.Namespace) -> int:
     """Test the driver, and print the faults found."""
     from petrobot.coordinator.launch import load_object
@@ -117,6 +128,7 @@ def run(options: argparse.Namespace) -> int:
             seconds=options.seconds,
             within=options.within,
             positions=options.positions,
+            progress=_progress(),
         )
     except DirectoryError as fault:  # it names the device itself
         raise CommandError(2, str(fault)) from fault
@@ -125,6 +137,7 @@ def run(options: argparse.Namespace) -> int:
     for text in (*found.faults, *found.notes, *found.busy):
         print(text)
     if not found.faults:
+        checked = " that were checked" if found.notes else ""
         doubt = ", as far as this busy computer can tell" if found.busy else ""
-        print(f"{options.device}: its driver keeps the rules{doubt}")
+        print(f"{options.device}: its driver keeps the rules{checked}{doubt}")
     return 1 if found.faults else 0

@@ -67,12 +67,16 @@ class TrialTokens:
             return self.begun
         index = self._net.transition_index[fired.transition]
         consumed, produced = dict(self._net.consume[index]), dict(self._net.produce[index])
-        for place in consumed.keys() & produced.keys() - self._actions:  # only read
-            least = min(consumed[place], produced[place])
-            consumed[place] -= least
-            produced[place] -= least
         borrowed: list[int] = []
         trials: list[int] = []
+        for place in consumed.keys() & produced.keys():  # only read, and runs go on
+            name = self._net.places[place]
+            taken = sum(run.rpartition("#")[0] == name for run in fired.runs)
+            least = min(consumed[place] - taken, produced[place])
+            consumed[place] -= least
+            produced[place] -= least
+            if least and place in self._actions:
+                trials += [*self._waiting[place]][:1]
         for place, weight in consumed.items():
             for _ in range(weight):
                 owed = place != own and self._free[place] <= self._net.initial[place]

@@ -283,9 +283,12 @@ class PickingLaboratory(LaboratoryParty):
         *,
         boot: str = "laboratory",
         directory: str = "",
+        judges: bool = True,
     ) -> None:
-        """`boot`, `directory`: as in services.comm.calls.callee."""
+        """`boot`, `directory`: as in services.comm.calls.callee. `judges`: whether the parts that
+        the task handles are the simulated ones."""
         super().__init__(name, where, boot, directory)
+        self._judges = judges
         cv2.setNumThreads(1)  # one thread: other nodes share the cores
         self._site = site
         self.arm = site.arm()
@@ -341,7 +344,9 @@ class PickingLaboratory(LaboratoryParty):
     # Services
 
     def score(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `Referee.score` of the trials in `cycles`."""
+        """Return `Referee.score` of the trials in `cycles`; nothing about parts that are real."""
+        if not self._judges:
+            return {}
         return self.referee.score(self.now, arguments.get("cycles") or [])
 
     def prepare(self, arguments: Mapping[str, Any]) -> None:
@@ -361,10 +366,16 @@ class PickingLaboratory(LaboratoryParty):
 def make_laboratory(directory: Directory, name: str) -> PickingLaboratory:
     """Return the laboratory of the simulated node `name` of the location file. Raises
     LaboratoryError."""
-    boot = f"{name} in lock step"
     site = picking_site_of(directory)
     try:
-        return PickingLaboratory(name, site, directory.party, boot=boot, directory=directory.hash)
+        return PickingLaboratory(
+            name,
+            site,
+            directory.party,
+            boot=f"{name} in lock step",
+            directory=directory.hash,
+            judges=any(d.config.get("source") == "sim" for d in directory.devices.values()),
+        )
     except KeyError as fault:
         raise LaboratoryError(
             f"{directory.source}: key {fault} is missing in the files of [parameters]; the shipped "

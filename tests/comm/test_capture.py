@@ -331,6 +331,17 @@ def test_a_network_camera_that_is_not_there_is_reported(network: Network) -> Non
     network.plug()
 
 
+def test_a_password_is_not_shown(network: Network, caplog: pytest.LogCaptureFixture) -> None:
+    network.unplug()
+    address = f"127.0.0.1:{network.port}/video"
+    images = open_images({"source": f"capture:http://ana:se@cret@{address}"}, time.monotonic)
+    with pytest.raises(ConnectionError, match=f"'http://{address}'.*USER:PASSWORD") as raised:
+        images.start(25.0)
+    images.close()
+    assert "cret" not in str(raised.value) + images.condition + caplog.text
+    network.plug()
+
+
 # --- sources by name --------------------------------------------------------------------------
 
 

@@ -234,3 +234,50 @@ def test_a_preempted_run_counts_in_its_trial_after_the_next_one_has_begun() -> N
     costs = [sum(entry.cost or 0.0 for entry in trial.runs) for trial in trials]
     # to a tick: to the learner a preempted run lasts from its token's coming to its being taken
     assert [end.cost for end in ends] == pytest.approx(costs, abs=0.01) and min(costs) > 0.9
+
+
+TRAY = """
+schema = 1
+[task]
+name = "tray"
+final = "rack == 0 and hand == 1"
+runs_place = "rack"
+[events.full]
+scope = "internal"
+by = "put"
+mean_wait = 1.0
+[primitive_tasks]
+put = { deadline = 3.0 }
+change = { deadline = 3.0 }
+[places]
+rack = { kind = "control", tokens = 1 }
+hand = { kind = "resource", tokens = 1 }
+trays = { kind = "resource", tokens = 1 }
+put = { kind = "action", holds = "hand" }
+change = { kind = "action" }
+[transitions]
+start = { in = ["rack"], out = ["put"] }
+full = { in = ["put:going", "trays"], out = ["change"], event = "full" }
+ready = { in = ["put:normal"] }
+changed = { in = ["change:normal"], out = ["trays"] }
+"""
+"""A run says with an event that a tray is full, and goes on."""
+
+
+def test_a_run_that_a_firing_only_reads_stays_the_same_run() -> None:
+    task = loads(TRAY, "tray.toml")
+    tokens, net = TrialTokens(task), task.net
+    marking = [*net.initial]
+    marking[net.place_index["rack"]] = 2
+
+    def fire(transition: str, *runs: str) -> int:
+        before, index = tuple(marking), net.transition_index[transition]
+        for arcs, sign in ((net.consume, -1), (net.produce, 1)):
+            for place, weight in arcs[index]:
+                marking[place] += sign * weight
+        return tokens.fired(Fired(1, transition, before, tuple(marking), "stability", runs))
+
+    assert [fire("start"), fire("full"), fire("ready", "put#1")] == [1, 1, 1]
+    assert fire("start") == 2 and tokens.of("put#2") == 2 and tokens.of("change#1") == 1
+    assert [fire("changed", "change#1"), fire("ready", "put#2")] == [1, 2]
+    assert not tokens.on_its_way(1) and not tokens.on_its_way(2)

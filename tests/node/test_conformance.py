@@ -110,6 +110,46 @@ def test_the_base_class_holds_for_a_driver_that_obeys_paused() -> None:
     assert checked(Forgets).faults == ["hold: answered 'held', and axis[0].at still changes"]
 
 
+@pytest.mark.parametrize("far", [0.03, 0.06, 0.12])  # 0.3 to 1.2 s
+def test_a_hold_is_tested_however_short_the_movement_is(far: float) -> None:
+    there_and_back = [{"to": far}, {"to": 0.0}]
+    assert check_driver(Obedient, there_and_back, simulated=True).faults == []
+    (fault,) = check_driver(Forgets, there_and_back, simulated=True).faults
+    assert fault.startswith(f"hold: answered 'held', and {{'to': {far}}} went on to its end; obey")
+
+
+class Lasting(Axis):
+    """Its device stays where it is, without a driver."""
+
+    obeys = ("dry_run",)
+    device = 0.0
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
+        super().__init__(config, ports)
+        self.at = self.goal = self.device
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        type(self).device = self.at
+
+
+def test_a_dry_run_that_nothing_shows_is_not_called_tested() -> None:
+    class Forgetful(Axis):
+        obeys = ("dry_run",)
+
+    found = check_driver(Forgetful, COMMANDS, simulated=True)
+    assert found.faults == []
+    assert found.notes[0].startswith("not checked: dry_run: a driver that is made again does not")
+    found = check_driver(Lasting, COMMANDS, simulated=True)
+    assert found.faults == ["dry_run: {'to': 0.2} moves the device: axis[0].at changed"]
+
+
+def test_progress_names_what_is_tested() -> None:
+    told = list[str]()
+    check_driver(Axis, COMMANDS, simulated=True, progress=told.append)
+    assert {"stop during a movement", "hold during {'to': 0.0}"} <= set(told)
+
+
 def test_a_driver_prepares_itself_when_its_keys_are_read() -> None:
     config = {"start": 0.1, "speed": 0.5}
     assert type("Slow", (Ready,), {"obeys": ("speed",)})(config, None).made == (0.1, 0.0, 0.5)

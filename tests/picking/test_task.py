@@ -3,6 +3,7 @@ repetition, and verdicts on failures."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.check import check
 from petrobot.coordinator.task.file import load
 from petrobot.services.comm.location_file import load as load_directory
+from petrobot.sim.picking.laboratory import make_laboratory
 from tests.sim.picking.bench import FILES
 
 PATH = FILES.parents[1] / "coordinator" / "tasks" / "pick_and_place.toml"
@@ -54,3 +56,28 @@ def test_parts_are_put_into_their_trays_and_the_same_seed_repeats_it(task: Task,
     assert first["in_tray"] == 1 and first["grips"] >= 1
     assert first["ends"][-1] == ("place_part", "success", "")
     assert run(task, arm, 2, **use) == first
+
+
+@pytest.mark.parametrize(
+    ("arm", "keys"),
+    [
+        ("so101", {"source": ("sim", "capture:0"), "port": ("pty:/tmp/petrobot-so101", "/dev/a")}),
+        ("ur", {"source": ("sim", "capture:0"), "host": ("unix:/tmp/petrobot-ur5e", "10.0.0.2")}),
+    ],
+)
+def test_on_the_robot_two_keys_differ_and_the_laboratory_judges_nothing(
+    arm: str, keys: dict[str, tuple[str, str]], tmp_path: Path
+) -> None:
+    for path in FILES.glob("*.toml"):
+        (tmp_path / path.name).write_text(path.read_text())
+    path = tmp_path / f"{arm}.services.toml"
+    text = path.read_text()
+    for key, (simulated, real) in keys.items():
+        old = f'{key} = "{simulated}"'
+        assert text.count(old) == 1
+        text = text.replace(old, f'{key} = "{real}"')
+    cycle = {"n": 1, "begun_ago": 9.0, "ended_ago": 0.0, "runs": []}
+    simulated_cell = make_laboratory(load_directory(path), "laboratory")
+    assert simulated_cell.score({"cycles": [cycle]})["parts"] == 5
+    path.write_text(text)
+    assert make_laboratory(load_directory(path), "laboratory").score({"cycles": [cycle]}) == {}

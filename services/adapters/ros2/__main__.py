@@ -102,14 +102,17 @@ class OfferedTask:
 
     async def _run(self, goal: str, args: Any) -> None:
         """Start a run, follow it to its end, and report to ROS 2."""
+        state = "refused"
         try:
             async with self._connect() as page:
-                ended = await self._follow(goal, page, await self._start(page, args))
+                run = await self._start(page, args)
+                state = "unknown"  # from here on it moves, whatever happens to this connection
+                ended = await self._follow(goal, page, run)
         except (OperatorError, ValueError) as fault:
-            ended = ABORTED, "refused", str(fault), ""
+            ended = ABORTED, state, str(fault), ""
         except Exception as fault:  # answer at once, so that the client does not wait for ever
             _log.exception("goal %s", goal)
-            ended = ABORTED, "refused", f"{type(fault).__name__}: {fault}", ""
+            ended = ABORTED, state, f"{type(fault).__name__}: {fault}", ""
         self._goal = ""
         self._result(goal, *ended)
 
@@ -118,15 +121,19 @@ class OfferedTask:
         if not isinstance(args, dict):
             raise ValueError(f"expected a goal with fields, found {args!r:.60}")
         parameters = {k: v for k, v in args.items() if k not in ("parameters", "runs", "seed")}
-        given = json.loads(args.get("parameters") or "{}")
+        text = args.get("parameters") or "{}"
+        try:
+            given = json.loads(text)
+        except (ValueError, TypeError, RecursionError):
+            given = None
         if not isinstance(given, dict):
-            raise ValueError(f"parameters: expected a JSON object, found {given!r:.60}")
+            raise ValueError(f"parameters: expected the text of a JSON object, found {text!r:.60}")
         start = {"task": self._options.task, "mode": self._options.mode}
         start |= {"parameters": {**parameters, **given}}
         start |= {name: args[name] for name in ("runs", "seed") if args.get(name)}
         answer = await _ordered(page, "start", start)
         if not answer.get("ok"):
-            raise ValueError(f"start: {answer.get('text')}")
+            raise ValueError(str(answer.get("text")))
         return str(answer["run"])
 
     async def _follow(self, goal: str, page: OperatorClient, run: str) -> tuple[int, str, str, str]:

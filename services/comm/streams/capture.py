@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -63,6 +64,7 @@ class CaptureImages:
         self, target: int | str, clock: Clock, settings: CaptureSettings | None = None
     ) -> None:
         self._target = target
+        self._name = f"camera {_without_login(target)!r}"
         self._clock = clock
         self._settings = settings or CaptureSettings()
         self._lock = threading.Lock()
@@ -90,7 +92,7 @@ class CaptureImages:
             self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
             self._thread.start()
         if not self._tried.wait(OPEN_LIMIT):
-            raise ConnectionError(f"camera {self._target!r}: no image within {OPEN_LIMIT:g} s")
+            raise ConnectionError(f"{self._name}: no image within {OPEN_LIMIT:g} s")
         if self._fault:
             raise ConnectionError(self._fault)
 
@@ -118,14 +120,14 @@ class CaptureImages:
         while not ended.is_set():
             try:
                 with _opened(self._target, self._settings, self._rate) as capture:
-                    fault = f"camera {self._target!r} was lost"
+                    fault = f"{self._name} was lost"
                     if capture is None:
                         fault = self._closed()
                     elif self._take(capture, ended):
                         wait = FIRST_WAIT
             except Exception as raised:  # of OpenCV: an image that it cannot convert, and others
                 text = " ".join(str(raised).split())
-                fault = f"camera {self._target!r}: no usable image, try another fourcc: {text:.300}"
+                fault = f"{self._name}: no usable image, try another fourcc: {text:.300}"
             if ended.is_set():
                 return
             self._fault = fault
@@ -135,7 +137,9 @@ class CaptureImages:
             wait = min(2.0 * wait, LONGEST_WAIT)
 
     def _closed(self) -> str:
-        text = f"camera {self._target!r} cannot be opened: is it plugged in, is the address right?"
+        text = f"{self._name} cannot be opened: is it plugged in, is the address right?"
+        if "://" in str(self._target):
+            text += " Does it want a login, as in http://USER:PASSWORD@HOST/?"
         if _is_pipeline(self._target) and not _has_gstreamer():
             text += " This OpenCV was built without GStreamer."
         return text
@@ -251,7 +255,8 @@ def _opened(target: int | str, settings: CaptureSettings, rate: float) -> Iterat
         for name, value in _properties(settings, rate):
             # Network streams accept none of them, which is normal: their sender decides.
             if not capture.set(getattr(cv2, name), value) and "://" not in str(target):
-                _log.warning("camera %r does not accept %s = %g", target, name, value)
+                shown = _without_login(target)
+                _log.warning("camera %r does not accept %s = %g", shown, name, value)
         yield capture
     finally:
         capture.release()
@@ -271,6 +276,11 @@ def _properties(settings: CaptureSettings, rate: float) -> Iterator[tuple[str, f
     if settings.exposure is not None:
         yield "CAP_PROP_AUTO_EXPOSURE", 1.0  # V4L2's number for manual
         yield "CAP_PROP_EXPOSURE", settings.exposure
+
+
+def _without_login(target: int | str) -> int | str:
+    """Return it as the operator's page and the log may show it."""
+    return re.sub(r"(?<=://)[^/\s]*@", "", target) if isinstance(target, str) else target
 
 
 def _is_pipeline(target: int | str) -> bool:
