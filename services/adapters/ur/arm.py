@@ -219,8 +219,9 @@ class Arm(Driver):
 
     def _look(self, now: float) -> None:
         """Find out whether the drives are enabled, and if not, why."""
-        fresh, data = now - self._seen < STALE and self._link.up, self._rtde.data
-        safety = data.get("safety_mode", 0) if fresh else 0
+        data = self._rtde.data  # empty until the first package of a connection
+        fresh = now - self._seen < STALE and self._link.up and bool(data)
+        safety = data["safety_mode"] if fresh else 0
         powered = fresh and safety in MAY_MOVE and data["robot_mode"] == RUNNING
         if self.dry_run:
             ready = fresh and self._wanted
