@@ -230,7 +230,8 @@ class Arm(Driver):
         if self._enabled and not ready:
             text = "program_lost" if powered else "power_off"
             if safety not in MAY_MOVE:
-                text = SAFETY.get(safety, "fault") if fresh else "link_lost"
+                # a mode of a later controller is a fault; one beyond all modes is a torn frame
+                text = SAFETY.get(safety, "fault") if 0 < safety < 100 else "link_lost"
             self._lose(text)
         elif ready and not self._enabled:
             self._enabled, self._reason = True, ""
