@@ -124,16 +124,17 @@ class ArmNumbers:
         ahead = aim - math.atan2(tip[1] - self.foot[1], tip[0] - self.foot[0])
         aimed = (reach[0] + math.remainder(ahead, 2.0 * math.pi), *reach[1:])
         found: list[tuple[float, tuple[float, ...]]] = []
-        for start in (near or reach, reach, aimed):
-            for half in (turn / 2, turn / 2 + math.pi / 2):
-                # straight down: half a turn about the line between x and the closing direction
-                pose = (x, y, z, math.pi * math.cos(half), math.pi * math.sin(half), 0.0)
-                with suppress(ValueError):
-                    joints = self.chain.joints(pose, start)
-                    pairs = zip(joints, near or start, strict=True)
-                    found.append((max(abs(a - b) for a, b in pairs), tuple(joints)))
-        if found:
-            return min(found)[1]
+        for starts in (1, 8):  # straight ahead of the arm a search may stop in a singular pose
+            for start in (near or reach, reach, aimed):
+                for half in (turn / 2, turn / 2 + math.pi / 2):
+                    # straight down: half a turn about the line between x and the closing direction
+                    pose = (x, y, z, math.pi * math.cos(half), math.pi * math.sin(half), 0.0)
+                    with suppress(ValueError):
+                        joints = self.chain.joints(pose, start, starts=starts)
+                        pairs = zip(joints, near or start, strict=True)
+                        found.append((max(abs(a - b) for a, b in pairs), tuple(joints)))
+            if found:
+                return min(found)[1]
         raise OutOfReachError(
             f"{self.name} cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with its fingers down"
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from petrobot import JointChain
@@ -32,6 +32,7 @@ ANGLE = st.floats(-1.5, 1.5)
 @settings(max_examples=20, deadline=None)
 @given(arm=st.sampled_from(ARMS), x=st.floats(0.125, 0.205), y=st.floats(-0.095, 0.095),
        z=st.floats(0.004, 0.065), turn=st.floats(-3.0, 3.0))  # fmt: skip
+@example(arm="so101", x=0.173828125, y=0.0, z=0.015625, turn=0.0)  # a singular pose on the way
 def test_over_and_tool_are_inverse_wherever_parts_lie(
     arm: str, x: float, y: float, z: float, turn: float
 ) -> None:
