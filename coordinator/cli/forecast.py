@@ -274,7 +274,7 @@ def _told(physics: str, plant: str = "") -> dict[str, str]:
 
 def _same_form(task: Task, ran: Path) -> bool:
     """Return whether a campaign's copy of its task file, which older campaigns lack, differs from
-    the task in words only, or in how many runs it asks for."""
+    the task in comments only, or in how many runs it asks for."""
     from petrobot.coordinator.launch import with_runs
     from petrobot.coordinator.task.file import dumps
 

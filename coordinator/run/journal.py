@@ -186,13 +186,15 @@ class JournalWriter:
             # A full disk may take a part: another try continues after it.
             while self._buffer:
                 del self._buffer[: os.write(self._file, self._buffer)]
-            kept = self._at.exists() and os.path.samestat(os.fstat(self._file), self._at.stat())
+            kept = os.path.samestat(os.fstat(self._file), self._at.stat())
+        except FileNotFoundError:
+            kept = False
         except OSError as fault:
             raise JournalError(
                 f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
             ) from fault
         if not kept:
-            # Writing goes on in a file without a name, and no resume would ever find it.
+            # The open file has lost its name, so no resume would ever find what is written to it.
             raise JournalError(
                 f"{self.path}: removed, moved or replaced while its run was active; nothing was "
                 "sent on the strength of its last records; put it back"
