@@ -30,7 +30,6 @@ from petrobot.coordinator.studies.forecast.history import (
     CENSORED,
     CUT,
     NONE,
-    STATUSES,
     Codes,
     Runs,
     RunVocabulary,
@@ -38,8 +37,8 @@ from petrobot.coordinator.studies.forecast.history import (
     Training,
     Values,
     Waits,
+    at_deadline,
 )
-from petrobot.coordinator.task import Status
 
 ALPHA = 0.01
 """Significance level of a split, over all factors of a node (Bonferroni)."""
@@ -183,7 +182,9 @@ class RunDistributions:
                 runs = own.of(own.action == action)
                 self.contexts[place, action] = self._grow(runs, deepest, outcomes=True)
             if len(own):
-                self.deadlines[place] = _deadline(training, place, own)
+                limit, outcome = at_deadline(training, place, own)
+                # measured times may be longer: they include waits, for a device for example
+                self.deadlines[place] = max(limit, float(own.took.max())), outcome
 
     @property
     def count(self) -> int:
@@ -234,22 +235,9 @@ class RunDistributions:
         return out
 
 
-def _deadline(training: Training, place: int, runs: Runs) -> tuple[float, int]:
-    """Return after how long a run in a place is ended, and its outcome then: the usual one of the
-    ends with ERROR. Measured times may be longer: they include waits, for a device for example."""
-    task, vocabulary = training.task.flat, training.vocabulary
-    name = vocabulary.places[place]
-    timeout = task.places[name].timeout
-    limit = min(task.primitive_task_of(name).deadline, np.inf if timeout is None else timeout)
-    error = STATUSES.index(Status.ERROR)
-    ended = runs.outcome[(runs.outcome > CUT) & (vocabulary.parts(runs.outcome)[0] == error)]
-    outcome = int(np.bincount(ended).argmax()) if len(ended) else vocabulary.outcome(error, -1)
-    return max(limit, float(runs.took.max())), outcome
-
-
 def with_weights(runs: Runs) -> Runs:
     """Return the runs that ended, weighted by the steps of the Aalen-Johansen estimate; the weights
-    sum to 1.
+    sum to 1. Each run stands for as many as its weight says.
 
     The runs that were cut off after the last end stay as members without an outcome (NONE) and
     share the weight that the estimate leaves.
@@ -257,11 +245,14 @@ def with_weights(runs: Runs) -> Runs:
     ordered = runs.of(np.lexsort((runs.censored, runs.took)))
     n, ended = len(runs), ~ordered.censored
     # Kaplan-Meier: an end leaves the share 1 - 1 / (runs still active) of the probability
-    stays = np.where(ended, 1.0 - 1.0 / (n - np.arange(n)), 1.0)
+    active = np.cumsum(ordered.weight[::-1])[::-1]
+    share = ordered.weight / np.where(active > 0.0, active, 1.0)
+    stays = np.where(ended, 1.0 - share, 1.0)
     left = np.concatenate([[1.0], np.cumprod(stays)])
     last = int(np.flatnonzero(ended)[-1]) + 1 if ended.any() else 0
     beyond = np.arange(n) >= last
-    weight = np.where(beyond, left[last] / max(1, n - last), -np.diff(left))
+    after = float(ordered.weight[last:].sum()) or 1.0
+    weight = np.where(beyond, left[last] * ordered.weight / after, -np.diff(left))
     return replace(ordered, weight=weight, outcome=np.where(beyond, NONE, ordered.outcome)).of(
         ended | beyond
     )
