@@ -130,7 +130,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     found = (
         _from_trials(training, request, weights, random)
         if straight
-        else _from_net(training, request, random)
+        else _from_net(training, request, random, asked)
     )
     if not training.task.flat.goal_transitions:
         del found["figures"]["R_goal"]
@@ -318,11 +318,13 @@ def _net_told(
 # --- figures of the simulated net ---
 
 
-def _from_net(training: Training, request: Request, random: np.random.Generator) -> dict[str, Any]:
+def _from_net(
+    training: Training, request: Request, random: np.random.Generator, asked: Sequence[str]
+) -> dict[str, Any]:
     net = _SimulatedNet(training)
     residual = residuals(training, net.replayed(request.seed)) if training.repeats else []
-    if request.changes:
-        net = _SimulatedNet(change_runs(training, request.changes))
+    if request.changes or asked:
+        net = _SimulatedNet(change_runs(training, request.changes), asked)
     whole = net.once(request.choices, request.point, random)
     samples = net.bootstrap(request, random)
     point, n = figures(whole), len(training.trials)
@@ -377,12 +379,16 @@ def _net_time(value: float, samples: Values, runs: int, training: int) -> dict[s
 class _SimulatedNet:
     """The task's net with the measured runs of one training."""
 
-    def __init__(self, training: Training) -> None:
-        """Raises ValueError for a net that cannot be simulated."""
-        self.structure, self.runs = (
-            Structure.of(training.task, training.whole),
-            RunDistributions(training),
-        )
+    def __init__(self, training: Training, asked: Sequence[str] = ()) -> None:
+        """`asked`: the primitive tasks whose actions are chosen otherwise than in the training.
+        Raises ValueError for a net that cannot be simulated."""
+        chosen = [
+            q
+            for q, place in enumerate(training.vocabulary.places)
+            if training.task.primitive_task_of(place).name in asked
+        ]
+        self.structure = Structure.of(training.task, training.whole)
+        self.runs = RunDistributions(training, chosen=chosen)
         self._training = training
         # Steps after which a simulated trial counts as endless (the forecast says how many did).
         # A heuristic: of n trials with geometric numbers of steps, one more is five times as long

@@ -326,6 +326,95 @@ def test_other_durations_and_shares_are_forecast_as_they_then_come(
         assert found["figures"][name]["value"] == pytest.approx(truth[name], rel=0.03)
 
 
+STEPS = with_transitions("""
+schema = 1
+[task]
+name = "steps"
+final = "jobs == 0 and free == 1"
+goal_transitions = ["done"]
+runs_place = "jobs"
+[primitive_tasks.look]
+goal = "seen"
+alternatives = ["look_0", "look_1", "look_2", "look_3", "look_4"]
+deadline = 9.0
+[primitive_tasks.plan]
+goal = "planned"
+alternatives = ["plan_0", "plan_1", "plan_2"]
+deadline = 9.0
+[primitive_tasks.grasp]
+goal = "held"
+alternatives = ["grasp_0", "grasp_1"]
+deadline = 9.0
+[places.jobs]
+kind = "control"
+tokens = 4
+[places.free]
+kind = "resource"
+tokens = 1
+[places.look]
+kind = "action"
+task = "look"
+[places.plan]
+kind = "action"
+task = "plan"
+[places.grasp]
+kind = "action"
+task = "grasp"
+begin: jobs, free -> look
+seen: look:normal -> plan
+not_seen: look:error -> free
+planned: plan:normal -> grasp
+not_planned: plan:error -> free
+done: grasp:normal -> free
+dropped: grasp:error -> free
+""")
+QUALITY = {
+    "look": (0.97, 0.90, 0.99, 0.80, 0.95),
+    "plan": (0.97, 0.85, 0.99),
+    "grasp": (0.95, 0.80),
+}
+"""How much each choice multiplies the chance to hold the part."""
+
+
+def steps(n: int, random: np.random.Generator) -> list[Trial]:
+    """Draw trials that choose at random; only the last step shows how good all choices were."""
+    out = []
+    for _ in range(n):
+        chosen = {place: int(random.integers(len(q))) for place, q in QUALITY.items()}
+        chance = float(np.prod([QUALITY[place][k] for place, k in chosen.items()]))
+        held = random.random() < chance
+        runs = []
+        for i, (place, k) in enumerate(chosen.items()):
+            status, taken = "success", ("seen", "planned", "done")[i]
+            if place == "grasp" and not held:
+                status, taken = "error", "dropped"
+            runs.append(RunEntry(place, f"{place}_{k}", 1.0 * i, 1.0, status, taken=taken))
+        out.append(Trial(1, 0.0, 3.0, True, int(held), runs[-1].status, "", runs, []))
+    return out
+
+
+@pytest.mark.parametrize("combination", [(1, 1, 1), (2, 2, 0)])
+def test_a_combination_that_few_trials_made_is_forecast_from_what_each_choice_does(
+    combination: tuple[int, int, int],
+) -> None:
+    """Ten of 300 trials made it. Without what each choice does elsewhere, the mean of twelve
+    forecasts is .69 for .61, and .85 for .93, and the intervals hold in five of twelve."""
+    task = loads(STEPS, "steps.toml")
+    chosen = dict(zip(QUALITY, combination, strict=True))
+    truth = float(np.prod([QUALITY[place][k] for place, k in chosen.items()]))
+    choices = {place: {f"{place}_{k}": 1.0} for place, k in chosen.items()}
+    found = [
+        forecast(task, steps(300, np.random.default_rng(seed)), choices=choices)
+        for seed in range(8)
+    ]
+    assert {one["from"] for one in found} == {"net"}
+    values = [one["figures"]["R_goal"]["value"] for one in found]
+    held = sum(
+        low <= truth <= high for low, high in (o["figures"]["R_goal"]["confidence"] for o in found)
+    )
+    assert np.mean(values) == pytest.approx(truth, abs=0.045) and held >= 6
+
+
 def test_a_change_by_nothing_changes_nothing() -> None:
     """The figures are those of the simulated net, to the bit."""
     task, trials = loads(RACE, "race.toml"), race(300, np.random.default_rng(3))
