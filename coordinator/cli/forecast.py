@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,6 +81,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="new runs take what this campaign has learned",
     )
     parser.add_argument(
+        *("--what-if", "-w"),
+        action="append",
+        default=[],
+        metavar="CHANGE",
+        help="other durations and shares than the training has: move_to_point.mean*=1.5 (a slower "
+        "arm), locate_ball.error.share=0.05 (may be repeated)",
+    )
+    parser.add_argument(
         "--replicates",
         type=whole(20),
         default=400,
@@ -119,6 +128,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Forecast, or compare: exit code 1 when the forecast is doubtful or disagrees."""
+    from petrobot.coordinator.analysis.formats.netfile import NetFileError
     from petrobot.coordinator.studies.campaign.plan import CampaignError
     from petrobot.coordinator.studies.forecast.history import ForecastError
 
@@ -140,11 +150,12 @@ def run(options: argparse.Namespace) -> int:
             why = "nothing is registered without --out FILE; add that, or leave this out"
             refuse_idle(options, why, idle={"doubtful"})
         return _forecast(options)
-    except (ForecastError, CampaignError) as fault:
+    except (ForecastError, CampaignError, NetFileError) as fault:
         raise CommandError(2, str(fault)) from fault
 
 
 def _forecast(options: argparse.Namespace) -> int:
+    from petrobot.coordinator.analysis.time.whatif import read_change
     from petrobot.coordinator.studies.forecast.registered import register, write
     from petrobot.coordinator.studies.forecast.tables import forecast_text
 
@@ -153,7 +164,11 @@ def _forecast(options: argparse.Namespace) -> int:
     file = task_path(options.task)
     trainings, estimates, about = _trainings(task, file, options.estimates, options.plant, cell)
     names = [name for name in options.regime.split(",") if name] or list(trainings)
-    requests = {name: _request(task, trainings, about, name, options) for name in names}
+    changes = [read_change(text) for text in options.what_if]
+    requests = {
+        name: replace(_request(task, trainings, about, name, options), changes=changes)
+        for name in names
+    }
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
     made = register(task, trainings, requests, about, estimates, cell)
@@ -480,6 +495,9 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
         "same_block": forecast["estimates"].get("block") in (None, plan.block),
         "doubts": {
             name: said["doubts"] for name, said in forecast["regimes"].items() if said.get("doubts")
+        },
+        "what_if": {
+            name: said["what_if"] for name, said in forecast["regimes"].items() if "what_if" in said
         },
         "same_task_file": forecast.get("task_sha256") in (None, plan.digests["task"]),
         **found,

@@ -4,9 +4,8 @@ The training chooses every alternative at random. The forecasts are the share of
 the mean and 90 % quantile of a trial's time, each with a 95 % interval for the new trials if the
 method has one.
 
-- petrobot: `register` (as `petrobot forecast`) for other choices and for other nets; for slower
-  and more faulty actions the stochastic view with the changes of `petrobot analyse --what-if`,
-  which has no intervals.
+- petrobot: `petrobot forecast`, with `--choose` for other choices, the changed task file for other
+  nets, and `--what-if` for slower and more faulty actions.
 - product: computed by hand. Steps succeed and last independently of each other: the
   product of their shares, the sum of their means, a normal quantile; intervals by a bootstrap.
 - bootstrap: the training trials that made the new choices, resampled; other changes are not seen.
@@ -16,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +25,30 @@ from numpy.typing import NDArray
 from experiments.against_trees.faults import Edit, Edits, apply
 from experiments.against_trees.results import PLANT, TASK, Line, Results, Size
 from experiments.against_trees.verified import petrobot
-from petrobot.coordinator.analysis.formats.netfile import NetFileError
-from petrobot.coordinator.analysis.time.completion import completion_time
-from petrobot.coordinator.analysis.time.stochastic import stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import forecast
-from petrobot.coordinator.analysis.time.whatif import Change, change_task
-from petrobot.coordinator.learning.propagation import measured_from
 from petrobot.coordinator.studies.campaign.block import LoadedPlan, run_block
-from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 from petrobot.coordinator.studies.campaign.trials import Trial
-from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.history import by_regime, trainings_of
-from petrobot.coordinator.studies.forecast.predict import Request
-from petrobot.coordinator.studies.forecast.registered import register
-from petrobot.coordinator.task import Task
-from petrobot.coordinator.task.file import loads
+from petrobot.coordinator.studies.forecast.registered import read
 
 REGIME = "A"
 """The plant knows no regimes; the task has one."""
-TRAINING_SEED, NEW_SEED = 300, 400
+TRAINING_SEED, NEW_SEED = 302, 402
 BLOCK = 20
 RESAMPLED = 400
 NORMAL_90 = 1.2816
 FIGURES = ("R_goal", "mean", "q90")
+FORECAST = "forecast.json"
 METHODS = ("petrobot", "product", "bootstrap")
 ALTERNATIVES = {
     "locate_ball": ("locate_background", "locate_mog2", "locate_hough", "locate_threshold",
                     "locate_compensated"),
     "track_ball": ("predict_least_squares", "predict_kalman", "predict_constant_velocity"),
     "move_to_point": ("intercept_tilted", "intercept_upright"),
+}  # fmt: skip
+TASK_ACTIONS = {
+    **ALTERNATIVES, "catch_ball": ("follow_and_wait",), "return_home": ("empty_and_home",),
+    "recover_arm": ("reset_and_home",),
 }  # fmt: skip
 CAMERA = (*ALTERNATIVES["locate_ball"], *ALTERNATIVES["track_ball"])
 ARM = (*ALTERNATIVES["move_to_point"], "follow_and_wait", "empty_and_home", "reset_and_home")
@@ -78,9 +70,14 @@ class StructuralChange:
     """How often the arm looks for a ball before it counts as not thrown."""
 
     @property
-    def by_view(self) -> bool:
-        """Whether petrobot forecasts it by the stochastic view."""
-        return bool(self.slow or self.faults)
+    def what_if(self) -> list[str]:
+        """The change of actions as options of `petrobot forecast`."""
+        of = {action: name for name, actions in TASK_ACTIONS.items() for action in actions}
+        slower = [f"{of[action]}.{action}.mean*={by:g}" for action, by in self.slow.items()]
+        faulty = [
+            f"{of[action]}.{action}.error.share*={by:g}" for action, by in self.faults.items()
+        ]
+        return [part for change in (*slower, *faulty) for part in ("--what-if", change)]
 
 
 def _choice(name: str, **choices: str) -> StructuralChange:
@@ -182,56 +179,22 @@ def trials_of(change: StructuralChange, folder: Path, runs: int) -> list[Trial]:
 # --- petrobot's forecasts -------------------------------------------------------------------------
 
 
-def by_petrobot(change: StructuralChange, train: Path, runs: int) -> dict[str, Any]:
-    """Forecast a change from the folder of the training campaign: value and interval by figure."""
-    task = loads(apply(TASK.read_text(encoding="utf-8"), change.net))
-    rows = list(read_table(train / TABLE))
-    estimates = estimates_of(task, rows, train.name)
-    if change.by_view:
-        try:
-            return _by_view(change, task, estimates)
-        except NetFileError as fault:
-            return {
-                **{name: [None, None] for name in FIGURES},
-                "from": "refused", "doubts": [str(fault)], "sha256": "",
-            }  # fmt: skip
-    choices = {name: {action: 1.0} for name, action in change.choices.items()}
-    trainings = trainings_of(task, estimates) if change.net else by_regime(task, rows)
-    usual = choices_of(trainings[REGIME])  # as often as the training chose
-    request = Request(runs, {**usual, **choices})
-    made = register(task, trainings, {REGIME: request}, {"estimates": train.name}, estimates)
+def by_petrobot(change: StructuralChange, train: Path, runs: int, out: Path) -> dict[str, Any]:
+    """Register a forecast of a change from the folder of the training campaign: value and interval
+    by figure."""
+    task, _ = world(change, out)
+    chosen = ",".join(f"{name}={action}" for name, action in change.choices.items())
+    petrobot(
+        "forecast", str(task), "--services", str(PLANT), "--estimates", str(train),
+        "--runs", str(runs), "--doubtful", "--out", str(out / FORECAST),
+        *change.what_if, *(("--choose", chosen) if chosen else ()),
+    )  # fmt: skip
+    made = read(out / FORECAST)
     said = made["regimes"][REGIME]
     figures = {name: said["figures"][name] for name in FIGURES}
     return {
         **{name: [one["value"], one["interval"]] for name, one in figures.items()},
         "from": said["from"], "doubts": said["doubts"], "sha256": made["sha256"],
-    }  # fmt: skip
-
-
-def _by_view(change: StructuralChange, task: Task, estimates: Any) -> dict[str, Any]:
-    measured = measured_from(task, estimates)
-    changes = []
-    for place in task.flat.places.values():
-        for (subject, action), known in measured.runs.items():
-            if subject != place.name:
-                continue
-            for status, estimate in known.items():
-                name = (place.task, action, status.value)
-                if action in change.slow and estimate.mean > 0:
-                    changes.append(Change((*name, "mean"), estimate.mean * change.slow[action]))
-                if action in change.faults and status.value == "error" and estimate.share > 0:
-                    share = min(1.0, estimate.share * change.faults[action])
-                    changes.append(Change((*name, "share"), share))
-    task, measured = change_task(task, measured, changes)
-    view = stochastic_view(task, measured)
-    view = replace(view, gspn=view.gspn.marked({str(task.runs_place): 1}))
-    found = forecast(view)
-    q90 = completion_time(found.chain, found.done.goal).quantile(0.9)
-    return {
-        "R_goal": [found.goal_reliability, None],
-        "mean": [found.done.mean, None],
-        "q90": [q90, None],
-        "from": "view", "doubts": [], "sha256": "",
     }  # fmt: skip
 
 
@@ -313,7 +276,7 @@ def _product(
             kept = rows[steps.chosen[name][rows] == wanted]
         ran = kept[~np.isnan(steps.seconds[name][kept])]
         seconds, well = steps.seconds[name][ran], steps.well[name][ran]
-        action = wanted or ALTERNATIVES.get(name, ARM_STEPS.get(name, ("",)))[0]
+        action = wanted or TASK_ACTIONS[name][0]
         slow, faults = change.slow.get(action, 1.0), change.faults.get(action, 1.0)
         right = float(well.mean()) if len(well) else 1.0
         if name != "catch_ball":  # a missed ball is not a fault
@@ -326,9 +289,6 @@ def _product(
             share *= 1.0 - (1.0 - right) ** looks
     spread = float(np.sqrt(variance))
     return share, mean, mean + NORMAL_90 * spread, spread
-
-
-ARM_STEPS = {"catch_ball": ("follow_and_wait",), "return_home": ("empty_and_home",)}
 
 
 def by_bootstrap(change: StructuralChange, steps: Steps, runs: int) -> dict[str, Any]:
@@ -358,7 +318,7 @@ def _with_intervals(point: Sequence[float], drawn: Samples) -> dict[str, Any]:
 # --- the part -------------------------------------------------------------------------------------
 
 
-def forecast_one(number: int, train: str, runs: int) -> Line:
+def forecast_one(number: int, train: str, folder: str, runs: int) -> Line:
     """Forecast a change by all methods."""
     change = CHANGES[number]
     rows = [row.trial for row in read_table(Path(train) / TABLE)]
@@ -368,7 +328,7 @@ def forecast_one(number: int, train: str, runs: int) -> Line:
         "name": change.name,
         "at": time.time(),
         "runs": runs,
-        "petrobot": by_petrobot(change, Path(train), runs),
+        "petrobot": by_petrobot(change, Path(train), runs, Path(folder)),
         "product": by_product(change, steps, runs),
         "bootstrap": by_bootstrap(change, steps, runs),
     }
@@ -395,13 +355,13 @@ def measure(results: Results, size: Size, workers: int) -> None:
             "--regime", REGIME, "--selector", "random", "--seed", str(TRAINING_SEED),
             "--block", str(BLOCK), "--workers", "1", "--out", str(train),
         )  # fmt: skip
-    keys = [f"{n:02}" for n in range(len(CHANGES))]
+    worlds = {f"{n:02}": results.folder / "worlds" / f"{n:02}" for n in range(len(CHANGES))}
     results.measure(
         "registered", forecast_one,
-        [(key, (n, str(train), size.trials)) for n, key in enumerate(keys)], workers,
+        [(key, (int(key), str(train), str(own), size.trials)) for key, own in worlds.items()],
+        workers,
     )  # fmt: skip
-    worlds = results.folder / "worlds"
     results.measure(
         "measured", measure_one,
-        [(key, (n, str(worlds / key), size.trials)) for n, key in enumerate(keys)], workers,
+        [(key, (int(key), str(own), size.trials)) for key, own in worlds.items()], workers,
     )  # fmt: skip

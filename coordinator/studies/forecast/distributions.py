@@ -18,7 +18,7 @@ marked as an extrapolation.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,7 +30,6 @@ from petrobot.coordinator.studies.forecast.history import (
     CENSORED,
     CUT,
     NONE,
-    STATUSES,
     Codes,
     Runs,
     RunVocabulary,
@@ -38,8 +37,8 @@ from petrobot.coordinator.studies.forecast.history import (
     Training,
     Values,
     Waits,
+    at_deadline,
 )
-from petrobot.coordinator.task import Status
 
 ALPHA = 0.01
 """Significance level of a split, over all factors of a node (Bonferroni)."""
@@ -51,6 +50,8 @@ OWN = 0.7
 is at least this share of the best one's."""
 SURE = 3.0
 """Standard errors beyond which a trend within a context counts."""
+FEW = 5
+"""Least number of ends of an outcome whose share may depend on an earlier choice."""
 GROUPS = 6
 """Largest number of classes of an earlier duration that split durations; half as many split
 outcomes."""
@@ -136,6 +137,15 @@ class ContextNode:
     children: list[ContextNode] = field(default_factory=list)
     durations: dict[int, ContextNode] = field(default_factory=dict)
     """In a leaf of an outcome tree: the tree of the durations of each outcome."""
+    chosen: Mapping[int, Codes] = field(default_factory=dict)
+    """In a leaf of an outcome tree: the action of the latest run in some earlier places, for each
+    member of `ends`."""
+
+    def leaves(self) -> list[ContextNode]:
+        """Return the leaves below this node."""
+        if self.split is None:
+            return [self]
+        return [leaf for child in self.children for leaf in child.leaves()]
 
 
 def siblings(training: Training, place: str) -> list[str]:
@@ -168,8 +178,12 @@ class RunDistributions:
     """Outcome probabilities and duration distributions of all actions of one regime:
     `contexts[(place code, action code)]`."""
 
-    def __init__(self, training: Training, *, unfold: bool = True) -> None:
+    def __init__(
+        self, training: Training, *, unfold: bool = True, chosen: Sequence[int] = ()
+    ) -> None:
+        """`chosen`: places whose choices may change outcomes elsewhere."""
         self.vocabulary = training.vocabulary
+        self._chosen = chosen
         self.contexts: dict[tuple[int, int], ContextNode] = {}
         self._numbers = 0
         self.deadlines: dict[int, tuple[float, int]] = {}
@@ -183,7 +197,9 @@ class RunDistributions:
                 runs = own.of(own.action == action)
                 self.contexts[place, action] = self._grow(runs, deepest, outcomes=True)
             if len(own):
-                self.deadlines[place] = _deadline(training, place, own)
+                limit, outcome = at_deadline(training, place, own)
+                # measured times may be longer: they include waits, for a device for example
+                self.deadlines[place] = max(limit, float(own.took.max())), outcome
 
     @property
     def count(self) -> int:
@@ -202,6 +218,7 @@ class RunDistributions:
             parts = [runs.of(child == c) for c in range(int(child.max()) + 1)]
             context.children = [self._grow(part, deepest - 1, outcomes=outcomes) for part in parts]
         elif outcomes:
+            context.chosen = {q: ended.seen.action[q] for q in self._chosen}
             deepest = DEEPEST if deepest else 0
             for code in np.unique(ended.outcome[ended.outcome != NONE]):
                 context.durations[int(code)] = self._grow(
@@ -234,22 +251,9 @@ class RunDistributions:
         return out
 
 
-def _deadline(training: Training, place: int, runs: Runs) -> tuple[float, int]:
-    """Return after how long a run in a place is ended, and its outcome then: the usual one of the
-    ends with ERROR. Measured times may be longer: they include waits, for a device for example."""
-    task, vocabulary = training.task.flat, training.vocabulary
-    name = vocabulary.places[place]
-    timeout = task.places[name].timeout
-    limit = min(task.primitive_task_of(name).deadline, np.inf if timeout is None else timeout)
-    error = STATUSES.index(Status.ERROR)
-    ended = runs.outcome[(runs.outcome > CUT) & (vocabulary.parts(runs.outcome)[0] == error)]
-    outcome = int(np.bincount(ended).argmax()) if len(ended) else vocabulary.outcome(error, -1)
-    return max(limit, float(runs.took.max())), outcome
-
-
 def with_weights(runs: Runs) -> Runs:
     """Return the runs that ended, weighted by the steps of the Aalen-Johansen estimate; the weights
-    sum to 1.
+    sum to 1. Each run stands for as many as its weight says.
 
     The runs that were cut off after the last end stay as members without an outcome (NONE) and
     share the weight that the estimate leaves.
@@ -257,11 +261,14 @@ def with_weights(runs: Runs) -> Runs:
     ordered = runs.of(np.lexsort((runs.censored, runs.took)))
     n, ended = len(runs), ~ordered.censored
     # Kaplan-Meier: an end leaves the share 1 - 1 / (runs still active) of the probability
-    stays = np.where(ended, 1.0 - 1.0 / (n - np.arange(n)), 1.0)
+    active = np.cumsum(ordered.weight[::-1])[::-1]
+    share = ordered.weight / np.where(active > 0.0, active, 1.0)
+    stays = np.where(ended, 1.0 - share, 1.0)
     left = np.concatenate([[1.0], np.cumprod(stays)])
     last = int(np.flatnonzero(ended)[-1]) + 1 if ended.any() else 0
     beyond = np.arange(n) >= last
-    weight = np.where(beyond, left[last] / max(1, n - last), -np.diff(left))
+    after = float(ordered.weight[last:].sum()) or 1.0
+    weight = np.where(beyond, left[last] * ordered.weight / after, -np.diff(left))
     return replace(ordered, weight=weight, outcome=np.where(beyond, NONE, ordered.outcome)).of(
         ended | beyond
     )
@@ -413,6 +420,9 @@ def first_statuses(vocabulary: RunVocabulary, runs: Runs, trials: int) -> Codes:
 # --- drawing ends of runs and waits ---
 
 Mask = NDArray[np.bool_]
+Ratios = Mapping[tuple[int, int, int, int], Mapping[int, Values]]
+"""By place, action, earlier place and choice there: what multiplies the share of each outcome, for
+each replicate."""
 
 
 @dataclass(frozen=True)
@@ -443,6 +453,7 @@ class Drawer:
     ) -> None:
         self._runs, self._waits, self._weights, self._random = runs, waits, weights, random
         self._bounds: dict[object, Values] = {}
+        self._ratios: dict[tuple[int, int, int, int], Mapping[int, Values]] = {}
 
     def ends(self, place: int, action: Codes, replicate: Codes, seen: Seen) -> Ends:
         """Draw the ends of runs that begin now in a place, given what ended before.
@@ -452,32 +463,99 @@ class Drawer:
         n = len(action)
         out = Ends(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n), np.zeros(n, np.bool_))
         for code in np.unique(action):
-            top = self._runs.contexts[place, int(code)]
-            self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
+            top, own = self._runs.contexts[place, int(code)], np.flatnonzero(action == code)
+            for columns, ratios in self._by_choice(place, int(code), top, own, seen):
+                self._descend(top, columns, replicate, seen, out, ratios)
         if out.beyond.any():  # the extrapolation knows no deadline
             longest, outcome = self._runs.deadlines[place]
             late = out.beyond & np.isfinite(out.took) & (out.took > longest)
             out.took[late], out.outcome[late], out.preempted[late] = longest, outcome, False
         return out
 
+    def _by_choice(
+        self, place: int, action: int, top: ContextNode, columns: Codes, seen: Seen
+    ) -> Iterator[tuple[Codes, Ratios]]:
+        """Yield columns with the same choices in the earlier places that may change outcomes, and
+        by how much each multiplies them."""
+        earlier = [q for q in top.leaves()[0].chosen if q != place]
+        if not earlier:
+            yield columns, {}
+            return
+        now = seen.action[np.array(earlier)][:, columns]
+        choices, kind = np.unique(now, axis=1, return_inverse=True)
+        for i, choice in enumerate(choices.T.tolist()):
+            keys = [(place, action, *pair) for pair in zip(earlier, choice, strict=True)]
+            for key in keys:
+                if key not in self._ratios:
+                    self._ratios[key] = self._ratios_of(top, *key[2:])
+            yield columns[kind.ravel() == i], {key: self._ratios[key] for key in keys}
+
+    def _ratios_of(self, top: ContextNode, earlier: int, choice: int) -> Mapping[int, Values]:
+        """Return by how much an earlier choice multiplies the share of each outcome, beside what
+        the contexts tell, for each replicate.
+
+        It is the ratio of observed and expected ends, shrunk towards 1 as James and Stein do
+        (1961): the contexts split only where a test is
+        sure, and several choices at once would otherwise be forecast as if none of them mattered.
+        """
+        even = np.ones((1, self._weights.shape[1]))
+        observed, expected, square = {}, {}, 0.0
+        leaves = [(leaf.ends, leaf.chosen[earlier]) for leaf in top.leaves()]
+        codes, counts = np.unique(
+            np.concatenate([ends.outcome[~ends.beyond] for ends, _ in leaves]), return_counts=True
+        )
+        frequent = codes[counts >= FEW].tolist()
+        actions = np.unique(np.concatenate([chosen for _, chosen in leaves])).tolist()
+        for action in actions:
+            for code in frequent:
+                seen, due = _ends_and_expected(leaves, even, action, code)
+                square += float((seen - due)[0] ** 2 / max(float(due[0]), 1e-9))
+            if action == choice:
+                for code in frequent:
+                    found = _ends_and_expected(leaves, self._weights, action, code)
+                    observed[code], expected[code] = found
+        free = (len(actions) - 1) * (len(frequent) - 1)
+        surely = max(0.0, 1.0 - max(0, free - 2) / square) if square > 0 else 0.0
+        return {
+            code: 1.0
+            + surely * (seen / np.where(expected[code] > 0, expected[code], seen + 1e-9) - 1.0)
+            for code, seen in observed.items()
+        }
+
     def _descend(
-        self, node: ContextNode, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+        self,
+        node: ContextNode,
+        columns: Codes,
+        replicate: Codes,
+        seen: Seen,
+        out: Ends,
+        ratios: Ratios,
     ) -> None:
         if node.split is None:
-            self._draw_leaf(node, columns, replicate, seen, out)
+            self._draw_leaf(node, columns, replicate, seen, out, ratios)
             return
         child = node.split.child(seen.of(columns), len(node.children))
         for c, below in enumerate(node.children):
             own = columns[child == c]
             if len(own):
-                self._descend(below, own, replicate, seen, out)
+                self._descend(below, own, replicate, seen, out, ratios)
 
     def _draw_leaf(
-        self, leaf: ContextNode, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+        self,
+        leaf: ContextNode,
+        columns: Codes,
+        replicate: Codes,
+        seen: Seen,
+        out: Ends,
+        ratios: Ratios,
     ) -> None:
         """Draw first the outcome, then the duration from the tree of that outcome."""
         ends = leaf.ends
-        index = self._draw(leaf.number, ends.weight, ends.trial, replicate[columns])
+        by_outcome = ratios if leaf.durations else {}  # a tree of durations has one outcome
+        key = (leaf.number, *by_outcome)
+        index = self._draw(
+            key, ends.weight, ends.trial, replicate[columns], ends.outcome, by_outcome
+        )
         if not leaf.durations and not ends.beyond.any():
             out.took[columns] = ends.took[index] + _along(ends, index, seen.took[:, columns])
             np.clip(out.took, 0.0, None, out=out.took)
@@ -489,7 +567,7 @@ class Drawer:
         for code, tree in leaf.durations.items():
             own = columns[ends.outcome[index] == code]
             if len(own):
-                self._descend(tree, own, replicate, seen, out)
+                self._descend(tree, own, replicate, seen, out, ratios)
 
     def _draw_beyond(self, leaf: ContextNode, columns: Codes, replicate: Codes, out: Ends) -> None:
         """Draw an end later than the longest run: at a constant rate, with outcomes in the observed
@@ -541,12 +619,23 @@ class Drawer:
             self._bounds[key] = np.where(often > 0, mean, seconds.sum() / came.sum())
         return self._bounds[key]
 
-    def _draw(self, key: object, weight: Values, trials: Codes, replicate: Codes) -> Codes:
+    def _draw(
+        self,
+        key: object,
+        weight: Values,
+        trials: Codes,
+        replicate: Codes,
+        outcome: Codes | None = None,
+        ratios: Ratios | None = None,
+    ) -> Codes:
         """Draw a member for each column by the weights of its replicate; by the plain weights if
-        the replicate leaves none."""
+        the replicate leaves none. `ratios` multiply the weights of outcomes."""
         bounds = self._bounds.get(key)
         if bounds is None:
             each = weight * self._weights[:, trials]
+            for by_outcome in (ratios or {}).values():
+                for code, ratio in by_outcome.items():
+                    each[:, outcome == code] *= ratio[:, None]
             each = np.where(each.sum(axis=1, keepdims=True) > 0, each, weight)
             bounds = np.cumsum(each, axis=1)
             # Row b of cumulated weights is shifted to (b, b + 1], so that one searchsorted over all
@@ -563,6 +652,21 @@ class Drawer:
     def chance(self, n: int) -> Values:
         """Return uniform numbers."""
         return self._random.random(n)
+
+
+def _ends_and_expected(
+    leaves: Sequence[tuple[EndDistribution, Codes]], weights: Values, choice: int, outcome: int
+) -> tuple[Values, Values]:
+    """Return how many runs after a choice ended with an outcome, and how many would have if the
+    choice did not matter in their contexts, by replicate."""
+    seen = due = np.zeros(len(weights))
+    for ends, chosen in leaves:
+        each = weights[:, ends.trial] * ~ends.beyond
+        whole, so = each.sum(axis=1), ends.outcome == outcome
+        own = each[:, chosen == choice].sum(axis=1)
+        seen = seen + each[:, so & (chosen == choice)].sum(axis=1)
+        due = due + own * each[:, so].sum(axis=1) / np.where(whole > 0, whole, 1.0)
+    return seen, due
 
 
 def _along(ends: EndDistribution, index: Codes, took: Values) -> Values:

@@ -3,11 +3,13 @@ the simulated net; and the product rule for comparison."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from petrobot.coordinator.analysis.time.whatif import Change
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
 from petrobot.coordinator.studies.forecast.direct import (
     LEAST,
@@ -29,7 +31,7 @@ from petrobot.coordinator.studies.forecast.distributions import (
     dependences,
     siblings,
 )
-from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values, change_runs
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
@@ -63,6 +65,10 @@ NO_TRIALS = (
     "an estimates file contains no trials: successive runs of one trial are taken as independent, "
     "and nothing tests that; give a campaign's folder"
 )
+CHANGED = (
+    "what if: the figures come from the simulated net, and no trial tests the changes: {}; runs "
+    "that depend on each other go on doing so as in the training"
+)
 OTHER_FORM = (
     "the campaign ran another form of this task: the figures come from the simulated net, and no "
     "trial tests them; run a campaign of this form to test them"
@@ -85,6 +91,13 @@ class Request:
     net: bool | None = None
     """True: the figures come from the simulated net in any case. False: from it only where the
     trials do not tell, and it is not compared with the training."""
+    changes: Sequence[Change] = ()
+    """Other durations and shares of statuses than the training has."""
+
+
+def told_changes(request: Request) -> str:
+    """Return the changes as they are written on the command line."""
+    return ", ".join(change.text for change in request.changes)
 
 
 def figures(played: Played, weights: Values | None = None) -> dict[str, float]:
@@ -111,12 +124,13 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     )
     _refuse_unmeasured(training, request.choices, asked)
     weights = trial_weights(training, request.choices)
-    straight = training.repeats and (not asked or effective(weights) >= LEAST) and not request.net
+    repeats = training.repeats and not request.changes
+    straight = repeats and (not asked or effective(weights) >= LEAST) and not request.net
     random = np.random.default_rng(request.seed)
     found = (
         _from_trials(training, request, weights, random)
         if straight
-        else _from_net(training, request, random)
+        else _from_net(training, request, random, asked)
     )
     if not training.task.flat.goal_transitions:
         del found["figures"]["R_goal"]
@@ -129,7 +143,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         **found,
         "product": product_rule(training, request.choices),
         "dependence": dependences(training),
-        **_by_place(training, request.choices),
+        **(_by_place(training, request.choices) if repeats else {"routing": {}}),
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
         "asked": asked,
         "not_back": sum(t.completed and t.time is None for t in training.trials),
@@ -140,9 +154,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
 def _by_place(training: Training, choices: Choices) -> dict[str, Any]:
     """Return how tokens left each place, in how many trials they came there, and how long the runs
     of each action took. An estimates file tells none of them, nor do trials of another form of the
-    task."""
-    if not training.repeats:
-        return {"routing": {}}
+    task, or before a change of durations and shares."""
     laws = [
         {
             "place": place,
@@ -306,9 +318,13 @@ def _net_told(
 # --- figures of the simulated net ---
 
 
-def _from_net(training: Training, request: Request, random: np.random.Generator) -> dict[str, Any]:
+def _from_net(
+    training: Training, request: Request, random: np.random.Generator, asked: Sequence[str]
+) -> dict[str, Any]:
     net = _SimulatedNet(training)
     residual = residuals(training, net.replayed(request.seed)) if training.repeats else []
+    if request.changes or asked:
+        net = _SimulatedNet(change_runs(training, request.changes), asked)
     whole = net.once(request.choices, request.point, random)
     samples = net.bootstrap(request, random)
     point, n = figures(whole), len(training.trials)
@@ -338,6 +354,7 @@ def _from_net(training: Training, request: Request, random: np.random.Generator)
                 *net.structure.assumptions,
                 *([] if training.whole else [NO_TRIALS]),
                 *([] if training.same else [OTHER_FORM]),
+                *([CHANGED.format(told_changes(request))] if request.changes else []),
             ],
         ),
     }
@@ -362,12 +379,16 @@ def _net_time(value: float, samples: Values, runs: int, training: int) -> dict[s
 class _SimulatedNet:
     """The task's net with the measured runs of one training."""
 
-    def __init__(self, training: Training) -> None:
-        """Raises ValueError for a net that cannot be simulated."""
-        self.structure, self.runs = (
-            Structure.of(training.task, training.whole),
-            RunDistributions(training),
-        )
+    def __init__(self, training: Training, asked: Sequence[str] = ()) -> None:
+        """`asked`: the primitive tasks whose actions are chosen otherwise than in the training.
+        Raises ValueError for a net that cannot be simulated."""
+        chosen = [
+            q
+            for q, place in enumerate(training.vocabulary.places)
+            if training.task.primitive_task_of(place).name in asked
+        ]
+        self.structure = Structure.of(training.task, training.whole)
+        self.runs = RunDistributions(training, chosen=chosen)
         self._training = training
         # Steps after which a simulated trial counts as endless (the forecast says how many did).
         # A heuristic: of n trials with geometric numbers of steps, one more is five times as long

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,6 +18,7 @@ from petrobot.coordinator.analysis.time.completion import completion_time, relia
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, trial_forecast
+from petrobot.coordinator.analysis.time.whatif import Change, change_task
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.propagation import ChoiceShares, measured_from
 from petrobot.coordinator.studies.campaign.observed import context_of
@@ -65,8 +66,12 @@ def register(
             )
         try:
             regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
+            if request.changes:
+                regimes[name]["what_if"] = [change.text for change in request.changes]
             if estimates is not None:
-                regimes[name]["gspn"] = exact(task, estimates, name, request.choices, cell)
+                regimes[name]["gspn"] = exact(
+                    task, estimates, name, request.choices, cell, request.changes
+                )
         except ValueError as fault:
             raise ForecastError(f"regime {name or '-'}: {fault}") from fault
     told = {
@@ -136,6 +141,7 @@ def exact(
     regime: str,
     choice: ChoiceShares,
     cell: Cell | None = None,
+    changes: Sequence[Change] = (),
 ) -> dict[str, Any]:
     """Return the figures of the stochastic view for one trial; only `why` if it cannot be solved.
 
@@ -149,6 +155,7 @@ def exact(
         known = measured_from(task, estimates, context, choice, devices=devices)
         unentered = _unentered(task, known)
         known = replace(known, runs={**known.runs, **unentered})
+        task, known = change_task(task, known, changes)
         view = stochastic_view(task, known, devices=devices)
         found = trial_forecast(view, SearchLimits(states=LARGEST))
         _refuse_guesses(task, found, unentered)

@@ -172,6 +172,8 @@ def agreement_text(found: Mapping[str, Any]) -> str:
                 f"distance {law['distance']}, p = {_p(law)}: {verdict}"
             )
     lines += _disagreeing(found)
+    for regime, changes in found["what_if"].items():
+        lines.append(f"note: what if, regime {regime or '-'}: {', '.join(changes)}")
     for regime, doubts in found["doubts"].items():
         lines += [
             f"note: registered although doubtful, regime {regime or '-'}: {doubt}"

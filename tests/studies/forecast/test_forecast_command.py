@@ -132,6 +132,29 @@ def test_a_what_if_is_compared_with_runs_that_choose_so(
     assert "the campaign chooses first=first_b" in capsys.readouterr().err
 
 
+def test_another_duration_is_registered_and_compared(
+    write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The comparison says what was changed, and that the runs are not like that; a wrong change is
+    one message."""
+    train = write_campaign("train", TASK, make_trials(300, np.random.default_rng(1)))
+    out = tmp_path / "f.json"
+    told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
+    slow = ["--what-if", "first.mean*=3", "--doubtful", "--out", str(out)]
+    assert main([*told, *slow]) == 0
+    assert "no trial tests the changes: first.mean*=3" in " ".join(capsys.readouterr().out.split())
+    assert registered.read(out)["regimes"][""]["what_if"] == ["first.mean*=3"]
+    same = write_campaign("same", TASK, make_trials(300, np.random.default_rng(2)), 2)
+    assert main(["forecast", "--compare", str(out), str(same)]) == 1
+    assert "note: what if, regime -: first.mean*=3" in capsys.readouterr().out
+    for change, words in (
+        ("first.mean", "not of the form"),
+        ("first.error.cv=2", "durations as measured"),
+    ):
+        assert main([*told, "--what-if", change]) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_shares_of_outgoing_transitions_are_those_of_the_chosen_actions(
     pair: Task, make_trials: Make
 ) -> None:
