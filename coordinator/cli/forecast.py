@@ -273,15 +273,14 @@ def _told(physics: str, plant: str = "") -> dict[str, str]:
 
 
 def _same_form(task: Task, ran: Path) -> bool:
-    """Return whether a campaign's copy of its task file, which older campaigns lack, differs from
-    the task in comments only, or in how many runs it asks for."""
+    """Return whether the trials of a campaign are trials of the task, by the campaign's copy of its
+    task file, which older campaigns lack; another number of runs is no change."""
     from petrobot.coordinator.launch import with_runs
-    from petrobot.coordinator.task.file import dumps
+    from petrobot.coordinator.studies.forecast.history import same_form
 
     if not ran.is_file():
         return False
-    before, now = (dumps(with_runs(one, 1)[0]) for one in (load_task(str(ran)), task))
-    return before == now
+    return same_form(with_runs(load_task(str(ran)), 1)[0], with_runs(task, 1)[0])
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:

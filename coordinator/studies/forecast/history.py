@@ -3,11 +3,12 @@ its trial."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,8 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
+from petrobot.coordinator.task.conditions import Domain, Expression, equivalent
+from petrobot.coordinator.task.validation import condition_domains, marking_domains
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -295,6 +298,51 @@ def by_regime(
         regime: Training.of(task, kept, devices=devices, same=same)
         for regime, kept in trials.items()
     }
+
+
+_WORDS = frozenset({
+    "goal", "text", "specification", "error_causes", "pictures",  # for people
+    "label", "x", "y", "macro", "expanded_from", "error_branch",  # for drawings
+    "estimates", "mean_wait", "cost", "costs", "target_reliability",  # no run depends on them
+    "holds", "subnets", "errors_to",  # arcs of the flat task say the same
+})  # fmt: skip
+"""Fields of a task's elements that no trial depends on."""
+_IN_ANY_ORDER = frozenset({"inputs", "outputs", "inhibitors", "goal_transitions", "sets"})
+
+
+def same_form(ran: Task, now: Task) -> bool:
+    """Return whether trials of one task are trials of the other: their flat nets are equal, with
+    names, the order of places and transitions, services and parameters. Words, the drawing,
+    declared guesses, the order of arcs, and how a condition is written make no difference."""
+    before, after = _without_macros(ran.flat), _without_macros(now.flat)
+    marking, values = marking_domains(after), condition_domains(after)
+    return (
+        list(before.places) == list(after.places)
+        and list(before.transitions) == list(after.transitions)
+        and _alike(before, after, {**marking, **values})
+    )
+
+
+def _without_macros(flat: Task) -> Task:
+    return replace(flat, places={n: p for n, p in flat.places.items() if p.kind is not Kind.MACRO})
+
+
+def _alike(one: Any, other: Any, domains: Mapping[str, Domain]) -> bool:
+    if isinstance(one, Expression) and isinstance(other, Expression):
+        return equivalent(one, other, domains)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_alike(one[k], other[k], domains) for k in one)
+    if not is_dataclass(one) or type(one) is not type(other):
+        return bool(one == other)
+    pairs = {
+        f.name: (getattr(one, f.name), getattr(other, f.name))
+        for f in fields(one)
+        if f.compare and f.name not in _WORDS
+    }
+    return all(
+        Counter(a) == Counter(b) if name in _IN_ANY_ORDER else _alike(a, b, domains)
+        for name, (a, b) in pairs.items()
+    )
 
 
 def of_this_form(task: Task, rows: Iterable[TrialRow]) -> list[TrialRow]:

@@ -199,11 +199,25 @@ def test_a_task_that_was_changed_is_forecast_by_the_simulated_net(
     write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The trials are of another form: they tell of its runs, but no figure comes straight from
-    them. A file that differs in words only, or in the number of runs, is the same task."""
+    them. A file that differs in words, guesses, the order of arcs, the wording of a condition or
+    the number of runs is the same task."""
     train = write_campaign("train", TASK, make_trials(200, np.random.default_rng(1), actions=BOTH))
     forms = {
         "words": "# another comment\n" + TASK.replace("tokens = 4", "tokens = 7"),
+        "texts": TASK.replace('goal = "done"', 'goal = "it is there"\nspecification = "seen"')
+        .replace("mean_wait = 1.0", 'mean_wait = 2.0\ntext = "a lamp"')
+        .replace('name = "pair"', 'name = "pair"\ngoal = "all jobs done"'),
+        "same end": TASK.replace(
+            '"jobs == 0 and free == 1"', '"not (free  != 1 or jobs > 0) and true"'
+        ),
+        "order of arcs": TASK.replace('["jobs", "free"]', '["free", "jobs"]'),
+        "in short": TASK.replace('task = "first"', 'task = "first"\nholds = ["free"]')
+        .replace('in = ["jobs", "free"]', 'in = ["jobs"]')
+        .replace('task = "second"', 'task = "second"\nholds = ["free"]')
+        .replace('out = ["free"]', "out = []"),
         "slower": TASK.replace("deadline = 9.0", "deadline = 8.0"),
+        "other end": TASK.replace('"jobs == 0 and free == 1"', '"jobs <= 1 and free == 1"'),
+        "other goal": TASK.replace('["done"]', '["missed"]'),
         "one action": TASK.replace('"first_a", ', ""),
         "another place": TASK.replace("second", "third"),
     }
@@ -215,7 +229,13 @@ def test_a_task_that_was_changed_is_forecast_by_the_simulated_net(
         found[name] = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
     assert {name: (said["from"], said["same"]) for name, said in found.items()} == {
         "words": ("trials", True),
+        "texts": ("trials", True),
+        "same end": ("trials", True),
+        "order of arcs": ("trials", True),
+        "in short": ("trials", True),
         "slower": ("net", False),
+        "other end": ("net", False),
+        "other goal": ("net", False),
         "one action": ("net", False),
         "another place": ("net", False),
     }
