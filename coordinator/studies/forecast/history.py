@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.ordinary import contended
-from petrobot.coordinator.analysis.time.measured import is_cause
+from petrobot.coordinator.analysis.time.measured import LATE, is_cause
 from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
 from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.estimates_file import (
@@ -243,7 +243,7 @@ class Training:
             task,
             vocabulary,
             kept,
-            _runs(vocabulary, kept, waiting),
+            as_arrays(vocabulary, kept, waiting),
             {name: known for name, known in found.items() if known is not None},
             whole,
             waiting,
@@ -345,18 +345,45 @@ def _alike(one: Any, other: Any, domains: Mapping[str, Domain]) -> bool:
     )
 
 
-def of_this_form(task: Task, rows: Iterable[TrialRow]) -> list[TrialRow]:
-    """Return the rows of an earlier form of a task without the runs that the task no longer has:
-    those of other places, or of other actions."""
+def of_this_form(task: Task, ran: Task | None, rows: Iterable[TrialRow]) -> list[TrialRow]:
+    """Return the rows of an earlier form of a task, `ran` if it is known, without the runs that the
+    task no longer has: those of other places, or of other actions. The others end by the deadlines
+    of the task as it is."""
+
+    def fitted(run: RunEntry) -> RunEntry:
+        before = ran is not None and ran.flat.places.get(run.place)
+        if ran is None or not before or before.kind is not Kind.ACTION:
+            return run
+        return ended_within(run, ran.longest_run(run.place), task.longest_run(run.place))
+
     return [
         row
         if row.trial is None
         else replace(
             row,
-            trial=replace(row.trial, runs=[run for run in row.trial.runs if _has(task.flat, run)]),
+            trial=replace(
+                row.trial, runs=[fitted(run) for run in row.trial.runs if _has(task.flat, run)]
+            ),
         )
         for row in rows
     ]
+
+
+def ended_within(run: RunEntry, before: float, limit: float) -> RunEntry:
+    """Return a run that a place ended after `before` s at the latest, as it is known of a place
+    that ends runs after `limit` s. One that was ended earlier would have continued: it is cut
+    off. One that took longer ends in ERROR then."""
+    late = run.cause == LATE[0] and not run.cancelled
+    if late and before < limit:
+        return replace(run, status="", cause="", taken="")
+    over = (before if late else run.seconds) - limit
+    if before == limit or over <= 0.0:
+        return run
+    took, seconds = max(0.0, run.took - over), max(0.0, run.seconds - over)
+    return replace(
+        run, took=took, seconds=seconds, status=Status.ERROR.value, cause=LATE[0], taken="",
+        cancelled=False,
+    )  # fmt: skip
 
 
 def _has(flat: Task, run: RunEntry) -> bool:
@@ -396,7 +423,10 @@ def _waited(timer: str, trial: Trial) -> list[float]:
     return out
 
 
-def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...], waiting: Mapping[str, str]) -> Runs:
+def as_arrays(
+    vocabulary: RunVocabulary, trials: Sequence[Trial], waiting: Mapping[str, str]
+) -> Runs:
+    """Return the runs of trials. `waiting`: by action the device for which its runs may wait."""
     places = {name: i for i, name in enumerate(vocabulary.places)}
     actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
     flat = [(i, run) for i, trial in enumerate(trials) for run in trial.runs if run.place in places]

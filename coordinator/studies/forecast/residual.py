@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind_from_stats
 
 from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
+from petrobot.coordinator.learning.propagation import limits_of
 from petrobot.coordinator.learning.records import WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.direct import FEWEST, holm, missions
@@ -447,6 +448,21 @@ def parallel_doubts(training: Training) -> list[str]:
         + f" may be active at the same time{more}, and an estimates file does not tell whether "
         "they are slow, or fail, together; give a campaign's folder"
         for p, q in together[:1]
+    ]
+
+
+def limit_doubts(training: Training) -> list[str]:
+    """Return in words which places end runs of one primitive task after different times, if the
+    training is an estimates file, which counts them together."""
+    if training.whole:
+        return []
+    flat = training.task.flat
+    return [
+        f"{' and '.join(p for p in training.vocabulary.places if flat.places[p].task == primitive)}"
+        f" end runs of {primitive} after different times ({', '.join(f'{s:g} s' for s in limits)}),"
+        " and an estimates file counts these runs together; give a campaign's folder"
+        for primitive in flat.primitive_tasks
+        if len(limits := sorted(limits_of(flat, primitive))) > 1
     ]
 
 
