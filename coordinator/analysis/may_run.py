@@ -285,7 +285,8 @@ def _ends_by_error(verdict: PropertyVerdict) -> Finding:
     from petrobot.coordinator.analysis.report import path_lines
 
     remedy = (
-        "a place outside `final` is never empty before: let a transition take its token, or write "
+        "two transitions may have each other's outputs; or a place outside `final` is never empty "
+        "before: let a transition take its token, or write "
         "`listen = true` in a place that waits for events all the time"
     )
     details = tuple(path_lines(verdict.witness, ""))
