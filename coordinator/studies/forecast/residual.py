@@ -363,7 +363,9 @@ def _branches(training: Training) -> dict[str, set[int]]:
 
 def event_doubts(training: Training) -> list[str]:
     """Return in words which events the simulated net cannot follow: where no single wait can be
-    repeated, it knows the rate of one event for each transition."""
+    repeated, it knows the rate of one event for each transition. Where waits were measured, each
+    transition has its own, which matters if they share an event; the training trials show how much,
+    if they can be compared."""
     flat = training.task.flat
     never = exclusive_places(flat.net, place_semiflows(flat.net))
     place = flat.net.place_index
@@ -377,11 +379,12 @@ def event_doubts(training: Training) -> list[str]:
                 "had come by then is not known"
             )
         known = training.waits.get(t.name)
-        if known is None or known.came is None or remembered is None:
+        by_rate = known is not None and known.came is not None
+        if remembered is None or (training.repeats and not by_rate):
             continue
         memory, early = remembered
         for u in flat.transitions.values():
-            apart = early is EarlyEvent.DROP and any(
+            apart = (early is EarlyEvent.DROP or not by_rate) and any(
                 tuple(sorted((place[a.place], place[b.place]))) in never
                 for a in t.inputs
                 for b in u.inputs
@@ -390,10 +393,10 @@ def event_doubts(training: Training) -> list[str]:
                 u is not t
                 and {*t.events} & {*u.events}
                 and not apart
-                and not (memory is EventMemory.LATCHED and _by_rate(training, u))
+                and not (by_rate and memory is EventMemory.LATCHED and _by_rate(training, u))
             ):
                 together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
-        if memory is EventMemory.LATCHED and reads_variables(t):
+        if by_rate and memory is EventMemory.LATCHED and reads_variables(t):
             out.append(
                 f"{t.name} waits for a latched event and reads variables, which the simulated net "
                 "does not know"
@@ -401,8 +404,8 @@ def event_doubts(training: Training) -> list[str]:
     for event, waiting in together.items():
         *some, last = waiting
         out.append(
-            f"{', '.join(some)} and {last} wait for one event, {event}, and their waits were "
-            "interrupted: the simulated net lets it come for each of them by itself"
+            f"{', '.join(some)} and {last} wait for one event, {event}, maybe together: the "
+            "simulated net lets it come for each of them by itself"
         )
     return out
 
