@@ -337,6 +337,9 @@ def _moved(k: int) -> Trial:
         (("timeout = 3.0", "timeout = 6.0"), None, None, True),
         (('[places.bring]\nkind = "action"', '[places.other]\nkind = "action"\ntimeout = 2.5'),
          0.6 * 0.4, None, False),
+        # a run token that is given back ends its trial
+        (('in = ["fetch:error"]\nout = ["free"]', 'in = ["fetch:error"]\nout = ["free", "jobs"]'),
+         0.6, None, False),
     ],
 )  # fmt: skip
 def test_a_changed_deadline_ends_the_runs_that_were_measured(
