@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import inf
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.engine import Phase
@@ -286,7 +285,8 @@ def _ends_by_error(verdict: PropertyVerdict) -> Finding:
     from petrobot.coordinator.analysis.report import path_lines
 
     remedy = (
-        "a place outside `final` is never empty before: let a transition take its token, or write "
+        "two transitions may have each other's outputs; or a place outside `final` is never empty "
+        "before: let a transition take its token, or write "
         "`listen = true` in a place that waits for events all the time"
     )
     details = tuple(path_lines(verdict.witness, ""))
@@ -302,10 +302,9 @@ def _late(task: Task) -> list[Finding]:
         good = primitive.estimates.get(Status.SUCCESS) if primitive else None
         if primitive is None or good is None or not good.share:
             continue
-        timeout = inf if place.timeout is None else place.timeout
-        if good.mean > (given := min(timeout, primitive.deadline)):
+        if good.mean > (given := task.longest_run(place.name)):
             key = f"primitive_tasks.{primitive.name}.deadline"
-            key = f"places.{place.name}.timeout" if timeout == given else key
+            key = f"places.{place.name}.timeout" if place.timeout == given else key
             text = (
                 f"runs end in ERROR after {given:g} s (cause `deadline`), but a SUCCESS is "
                 f"declared to take {good.mean:g} s on average"

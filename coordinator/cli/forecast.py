@@ -256,9 +256,10 @@ def _trainings(
         raise CommandError(2, f"{path}: --plant {plant}: the campaign's runs are {own}")
     _refuse_other_task(task, plan, path)
     rows = list(read_table(path / TABLE))
-    same = digest(file) == plan.digests["task"] or _same_form(task, path / TASK_COPY)
+    ran = load_task(str(path / TASK_COPY)) if (path / TASK_COPY).is_file() else None
+    same = digest(file) == plan.digests["task"] or _same_form(task, ran)
     if not same:
-        rows = of_this_form(task, rows)
+        rows = of_this_form(task, ran, rows)
     found = by_regime(task, rows, devices_of(cell), same)
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")
@@ -287,16 +288,13 @@ def _told(physics: str, plant: str = "") -> dict[str, str]:
     return {k: v for k, v in (("plant", plant), ("physics", physics)) if v}
 
 
-def _same_form(task: Task, ran: Path) -> bool:
-    """Return whether a campaign's copy of its task file, which older campaigns lack, differs from
-    the task in comments only, or in how many runs it asks for."""
+def _same_form(task: Task, ran: Task | None) -> bool:
+    """Return whether the trials of a campaign are trials of the task, by the campaign's copy of its
+    task file, which older campaigns lack; another number of runs is no change."""
     from petrobot.coordinator.launch import with_runs
-    from petrobot.coordinator.task.file import dumps
+    from petrobot.coordinator.studies.forecast.history import same_form
 
-    if not ran.is_file():
-        return False
-    before, now = (dumps(with_runs(one, 1)[0]) for one in (load_task(str(ran)), task))
-    return before == now
+    return ran is not None and same_form(with_runs(ran, 1)[0], with_runs(task, 1)[0])
 
 
 def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:

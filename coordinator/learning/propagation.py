@@ -31,7 +31,7 @@ from petrobot.coordinator.learning.objective import (
     objective,
 )
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
-from petrobot.coordinator.task import Estimate, Executed, Kind, Place, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
 
 # --- competing risks ---
 
@@ -107,6 +107,7 @@ def measured_from(
     choice: ChoiceShares | None = None,
     kinds: Mapping[tuple[str, str], Mapping[str, int]] | None = None,
     devices: Mapping[str, str] | None = None,
+    apart: Mapping[str, Mapping[str, Tally]] | None = None,
 ) -> Measured:
     """Return the input of the stochastic view from estimates of one context (None: of all contexts
     together).
@@ -118,6 +119,8 @@ def measured_from(
     allows it (another run ended) is not a risk; it only cuts the run off, as an abort does, and the
     net says when. `devices`: the device of each action that has one, if the view knows them; where
     runs may have to wait for one, their measured wait is left out, since the view has it itself.
+    `apart`: by place, the tally of each action in this place alone, where that is known and others
+    of its primitive task end their runs after another time.
     """
     held = contended(task, devices or {})
     runs: dict[tuple[str, str], dict[Status, Estimate]] = {}
@@ -130,26 +133,27 @@ def measured_from(
     for place in task.flat.places.values():
         if place.kind is not Kind.ACTION:
             continue
-        takers = _preempting(task, place.name)
+        takers, own = _preempting(task, place.name), (apart or {}).get(place.name, {})
         for action, by_context in estimates.of(place.task, context).items():
             tally = reduce(Tally.merged, by_context.values(), Tally())
-            causes[place.task, action], pooled = _causes(tally)
-            if pooled:
-                mixed.add((place.task, action))
             started = tally.runs + tally.censored + sum(tally.not_executed.values())
+            tally = own.get(action, tally)
+            key = (place.name, action)
+            causes[key], pooled = _causes(tally)
+            if pooled:
+                mixed.add(key)
             if not tally.runs and not tally.censored:
                 continue
             often.setdefault(place.task, {})[action] = float(started)
-            key = (place.name, action)
             waits_in_view = (devices or {}).get(action, "") in held
             extra = 0.0 if waits_in_view or not tally.waited.n else tally.waited.mean
             runs[key], preempted[key] = _ends(tally, takers, extra)
-            errors = causes[place.task, action][Status.ERROR]
+            errors = causes[key][Status.ERROR]
             if at_deadline := added(n for (cause, _), n in errors.items() if cause == LATE[0]):
                 share = at_deadline / added(errors.values())
-                late[key] = Estimate(share, _limit(task, place) + extra, 0.0)
+                late[key] = Estimate(share, task.longest_run(place.name) + extra, 0.0)
             sources[key] = _source(tally, (kinds or {}).get((place.task, action), {}))
-            if len(limits := _limits(task, place.task)) > 1:
+            if action not in own and len(limits := limits_of(task, place.task)) > 1:
                 ends = " and ".join(f"{s:g} s" for s in sorted(limits))
                 sources[key] += f", together at places that end runs after {ends}"
             if not takers:
@@ -167,16 +171,10 @@ def measured_from(
     )
 
 
-def _limit(task: Task, place: Place) -> float:
-    """Return after how long a run in a place is ended (s)."""
-    timeout = inf if place.timeout is None else place.timeout
-    return min(task.primitive_task_of(place.name).deadline, timeout)
-
-
-def _limits(task: Task, primitive: str) -> set[float]:
+def limits_of(task: Task, primitive: str) -> set[float]:
     """Return after how long runs of a primitive task are ended (s), at its different places. Their
     runs are counted together, so each place gets the mixture."""
-    return {_limit(task, p) for p in task.flat.places.values() if p.task == primitive}
+    return {task.longest_run(p.name) for p in task.flat.places.values() if p.task == primitive}
 
 
 def _causes(tally: Tally) -> tuple[dict[Status, dict[Ending, float]], bool]:

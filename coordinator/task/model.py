@@ -141,6 +141,13 @@ class Task:
         """Return the primitive task of an action place of the flat task. Raises KeyError."""
         return self.primitive_tasks[self.flat.places[place].task]
 
+    def longest_run(self, place: str) -> float:
+        """Return after how many seconds a run in an action place of the flat task is ended: by the
+        deadline of its primitive task, or by the place's shorter `timeout`."""
+        timeout = self.flat.places[place].timeout
+        deadline = self.primitive_task_of(place).deadline
+        return deadline if timeout is None else min(deadline, timeout)
+
     def initial_variables(self) -> dict[str, Value]:
         """Return variables and parameters before a mission run begins."""
         return {v.name: v.initial for v in self.variables.values()} | dict(self.parameters)

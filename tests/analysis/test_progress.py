@@ -113,6 +113,55 @@ STUCK: dict[str, Case] = {
         "parts == 0 and arm == 1",
         ("next needs arm, which is empty: taken by `next`, never returned by `dropped`",),
     ),
+    "an error branch ends in a place that nothing takes from": Case(
+        "arm~=1 parts=2 bin. look!",
+        {
+            "next": {"in": "parts arm", "out": "look"},
+            "seen": {"in": "look:normal", "out": "arm"},
+            "dropped": {"in": "look:error", "out": "bin"},
+        },
+        "parts == 0 and arm == 1 and bin == 0",
+        (
+            "next needs arm, which is empty: taken by `next`, still held with bin, and no "
+            "transition takes bin",
+        ),
+    ),
+    "a stock is used up": Case(
+        "tips=5 more arm~=1 jobs=6 fill! refill! tubes spin! warm look! broken",
+        {
+            "next": {"in": "jobs arm tips", "out": "fill"},
+            "filled": {"in": "fill:normal", "out": "tubes arm"},
+            "spilt": {"in": "fill:error", "out": "jobs arm tips"},
+            "fetch": {"in": "more !tips", "out": "refill"},
+            "fetched": {"in": "refill:normal", "out": "tips*3"},
+            "not_fetched": {"in": "refill:error", "out": "broken"},
+            "start": {"in": "tubes*2", "out": "spin"},
+            "spun": {"in": "spin:normal", "out": "warm"},
+            "spin_bad": {"in": "spin:error", "out": "broken"},
+            "see": {"in": "warm arm", "out": "look"},
+            "seen": {"in": "look:normal", "out": "arm"},
+            "unseen": {"in": "look:error", "out": "arm"},
+        },
+        "jobs == 0 and arm == 1 and tubes == 0",
+        ("next needs tips, which is empty", "tips: taken by `next`; only `spilt`"),
+        more={"final_error": parse("broken >= 1")},
+    ),
+    "one of two exits gives back too little": Case(
+        "slots~=2 jobs=4 broken fill! tubes spin! look!",
+        {
+            "next": {"in": "jobs slots", "out": "fill"},
+            "filled": {"in": "fill:normal", "out": "tubes"},
+            "spilt": {"in": "fill:error", "out": "jobs slots"},
+            "start": {"in": "tubes*2", "out": "spin"},
+            "spun": {"in": "spin:normal", "out": "look"},
+            "spin_bad": {"in": "spin:error", "out": "broken"},
+            "seen": {"in": "look:normal", "out": "slots"},
+            "unseen": {"in": "look:error", "out": "slots*2"},
+        },
+        "jobs == 0 and slots == 2",
+        ("next needs slots, which is empty: taken by `next`, never returned by `seen`",),
+        more={"final_error": parse("broken >= 1")},
+    ),
     "a preempting event can only come while the run is active": Case(
         "go=1 hold! done",
         {

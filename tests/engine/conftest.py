@@ -55,9 +55,9 @@ def make_task(
 ) -> Task:
     """A task from words.
 
-    Places: `a!` action, `a!2` action with 2 servers, `r~` resource, `c` control; `=N` tokens, `/N`
-    capacity. Each action place x runs the primitive task x with the action do_x. Events: `e` pulse,
-    `e*` latched, `e+` latched and kept, `e<x` internal to x.
+    Places: `a!` action, `a!2` action with 2 servers, `r~` resource, `p.` plain, `c` control; `=N`
+    tokens, `/N` capacity. Each action place x runs the primitive task x with the action do_x.
+    Events: `e` pulse, `e*` latched, `e+` latched and kept, `e<x` internal to x.
     """
     read_places = {p.name: p for p in map(_place, places.split())}
     for name, mapping in (args or {}).items():
@@ -97,8 +97,8 @@ def _place(word: str) -> Place:
         name, _, servers = name.partition("!")
         capacity, k = int(room) if room else None, int(servers) if servers else None
         return Place(name, Kind.ACTION, int(tokens or 0), capacity, task=name, servers=k)
-    kind = Kind.RESOURCE if name.endswith("~") else Kind.CONTROL
-    return Place(name.rstrip("~"), kind, int(tokens or 0), int(room) if room else None)
+    kind = {"~": Kind.RESOURCE, ".": Kind.PLAIN}.get(name[-1], Kind.CONTROL)
+    return Place(name.rstrip("~."), kind, int(tokens or 0), int(room) if room else None)
 
 
 def _event(word: str) -> Event:

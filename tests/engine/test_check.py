@@ -56,6 +56,22 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             lambda t: t("a!=1 y", {**A, "n": {"in": "a:normal", "when": "a.status == 'success'"}}),
         ),
         (
+            "never-true",
+            E,
+            "transitions.n.when",
+            lambda t: t(
+                "a!=1 y",
+                {**A, "n": {"in": "a:normal", "when": "k < 2 and k > 4"}, "m": {"in": "a:normal"}},
+                variables={"k": 0},
+            ),
+        ),
+        (
+            "late-timer",
+            W,
+            "transitions.late.after",
+            lambda t: t("a!=1 y", {**A, "late": {"in": "a:preempt=none", "after": 10.5}}),
+        ),
+        (
             "unsettled-conflict",
             W,
             "transitions.t",

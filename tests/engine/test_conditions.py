@@ -16,6 +16,7 @@ from petrobot.coordinator.task.conditions import (
     ConditionFault,
     Domain,
     covering,
+    equivalent,
     exclusive,
     kind_faults,
     parse,
@@ -172,6 +173,21 @@ def test_too_many_regions_are_unknown() -> None:
     text = " and ".join(f"{n} > {i} and {n} < {i + 9}" for i, n in enumerate(names))
     domains = {n: Domain("float") for n in names}
     assert exclusive([parse(text), parse(f"not ({text})")], domains).answer is Certainty.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("n > 2 and b", "b  and not (n <= 2)", True),
+        ("n > 2 or n <= 2", "true", False),  # without a value, no order holds
+        ("n >= 3", "n > 2", True),
+        ("x >= 3", "x > 2", False),
+        ("n == 1", "m == 1", False),
+    ],
+)
+def test_equal_conditions(one: str, other: str, same: bool) -> None:
+    domains = {"n": Domain("int"), "m": Domain("int"), "x": Domain("float"), "b": Domain("bool")}
+    assert equivalent(parse(one), parse(other), domains) is same
 
 
 def test_always_true_is_never_exclusive() -> None:

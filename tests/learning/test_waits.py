@@ -355,6 +355,9 @@ second = { in = ["other"], out = ["end"], event = "bell" }
         task = loads(text.replace("MEMORY", memory), "two.toml")
         told = event_doubts(Training.of(task, [Trial(1, 0.0, waits=ended)]))
         assert told == []
+        # of another form of the task no trial shows what that does
+        told = event_doubts(Training.of(task, [Trial(1, 0.0, waits=ended)], same=False))
+        assert ["first and second wait for one event" in doubt for doubt in told] == [True]
         cut = [*ended, Waited("first", 1.0, WaitEnd.CUT)]
         (told,) = [event_doubts(Training.of(task, [Trial(1, 0.0, waits=cut)]))]
         doubtful = [True] if memory == "pulse" else []

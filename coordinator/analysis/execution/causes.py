@@ -426,8 +426,8 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
     The net as it was meant returns what it takes: weights y >= 0 exist that every firing keeps. So
     the y that the fewest transitions of the real net change (least sum of |y C|, a linear program)
     show the transition that is wrong. What takes or gives tokens of the place itself is believed
-    first; what gives nothing at all, last. No place is weighed that nothing takes from, except an
-    end of the task (`ends`), and none that has tokens at the beginning, such as another resource: a
+    first; what gives nothing at all, last. No place is weighed that nothing takes from, except
+    those in `ends`, and none that has tokens at the beginning, such as another resource: a
     token that arrives there was returned.
     """
     from scipy.optimize import linprog
@@ -443,7 +443,8 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
         entries += [(t, column[p], float(c)) for p, c in own if p in column]
         entries += [(t, n + 2 * t, 1.0), (t, n + 2 * t + 1, -1.0)]
         doubt = 100.0 if dict(own).get(place) else 1.0 if net.produce[t] else 0.9
-        cost[n + 2 * t : n + 2 * t + 2] = doubt
+        # A gain explains no lack.
+        cost[n + 2 * t : n + 2 * t + 2] = doubt, 1.5 * doubt
     rows, columns, values = zip(*entries, strict=True)
     equal = csr_array((values, (rows, columns)), shape=(m, n + 2 * m))
     bounds = [(1.0, 1.0), *[(0.0, None)] * (n - 1 + 2 * m)]
@@ -453,9 +454,23 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
 
 
 def _ends(draft: Draft) -> frozenset[int]:
-    """Return the places at which the task gives up as designed."""
+    """Return the places at which tokens stay for good and may keep others: where the task gives up
+    as designed, and plain places that nothing takes from, which `final` wants empty."""
     task, net = draft.compiled.task, draft.compiled.net
     names = task.final_error.names if task.final_error is not None else frozenset[str]()
+    taken = {p for arcs in net.consume for p, _ in arcs}
+    empty = {
+        node.left.name
+        for node in conjuncts(task.final.tree)
+        if isinstance(node, Compare)
+        and isinstance(node.left, Name)
+        and not Expression("", node).holds(dict.fromkeys(net.places, 1))
+    }
+    names |= {
+        name
+        for p, name in enumerate(net.places)
+        if p not in taken and name in empty and task.places[name].kind is Kind.PLAIN
+    }
     return frozenset(p for p, name in enumerate(net.places) if name in names and not net.initial[p])
 
 
@@ -493,15 +508,36 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
         return f"{taker}, and no transition returns it"
     loser = _loser(net, draft, firings, place)
     if loser is not None:
+        # Several tokens of a control place are a stock, which may be used up; one may be a flag.
+        counts = draft.compiled.task.places[net.places[place]].kind is Kind.CONTROL
+        near = _feeding(net, givers).intersection(p for p, _ in net.consume[loser])
+        if counts and (net.initial[place] > 1 or not near):
+            return f"{taker}; only {back} can fill it"
         if any(p == place for p, _ in net.consume[loser]):
             return f"{taker}, and nothing that follows it returns it"
         return f"{taker}, never returned by `{net.transitions[loser]}`"
+    kept = [
+        net.places[p]
+        for p in held
+        if draft.compiled.task.places[net.places[p]].kind is Kind.PLAIN
+        and not any(p == q for arcs in net.consume for q, _ in arcs)
+    ]
+    never = f", and no transition takes {' and '.join(kept)}"
     where = (
-        f"still held with {' and '.join(net.places[p] for p in held)}"
+        f"still held with {' and '.join(net.places[p] for p in held)}{never * bool(kept)}"
         if held
         else f"to be returned by {back}"
     )
     return f"{taker}, {where}"
+
+
+def _feeding(net: Net, wanted: Collection[int]) -> set[int]:
+    """Return the places, without tokens at the beginning, from which arcs lead to transitions."""
+    reached, todo = set[int](), set(wanted)
+    while new := {p for t in todo for p, _ in net.consume[t] if not net.initial[p]} - reached:
+        reached |= new
+        todo = {t for t, arcs in enumerate(net.produce) if any(p in new for p, _ in arcs)}
+    return reached
 
 
 def _elsewhere(net: Net, order: list[int], givers: list[int]) -> str:

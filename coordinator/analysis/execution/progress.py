@@ -624,6 +624,9 @@ class Progress:
                     done = (r.place for r in self.x.states[i].runs() if r.phase is Phase.DONE)
                     for name in dict.fromkeys(done):
                         details.append(f"{name} has ended: {awaiting(self.x, int(i), name)}")
+                    details.append(
+                        f'if tokens of {place.name} are used up or counted, write kind = "control"'
+                    )
                     return self._no(reason, int(i), tuple(details))
         return self._yes("every resource has its initial number of tokens at the end")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import inf, sqrt
+from math import sqrt
 from typing import NamedTuple, TypeVar
 
 from petrobot.coordinator.task import (
@@ -239,8 +239,7 @@ class Numbers:
     def _cut(
         self, place: Place, estimates: Mapping[Status, Estimate]
     ) -> tuple[Mapping[Status, Estimate], Estimate]:
-        deadline = self.task.primitive_task_of(place.name).deadline
-        deadline = min(deadline, inf if place.timeout is None else place.timeout)
+        deadline = self.task.longest_run(place.name)
         if any(e.share > 0 and not e.mean > 0 for e in estimates.values()):
             return estimates, Estimate(0.0, deadline)  # another message names the missing mean
         found, late = cut(estimates, deadline)

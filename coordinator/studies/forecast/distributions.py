@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, chi2_contingency
 
+from petrobot.coordinator.studies.campaign.trials import RunEntry
 from petrobot.coordinator.studies.forecast.history import (
     CENSORED,
     CUT,
@@ -37,7 +38,10 @@ from petrobot.coordinator.studies.forecast.history import (
     Training,
     Values,
     Waits,
+    as_arrays,
     at_deadline,
+    changed,
+    ended_within,
 )
 
 ALPHA = 0.01
@@ -158,20 +162,25 @@ def siblings(training: Training, place: str) -> list[str]:
 
 
 def lent_runs(training: Training, place: int) -> Runs:
-    """Return runs that stand for those of a place that no run entered. Which transition took a run
-    says nothing about another place: what preempted it cut it off there."""
-    names = training.vocabulary
-    lenders = [names.places.index(p) for p in siblings(training, names.places[place])]
-    runs = training.runs.of(np.isin(training.runs.place, lenders))
-    status, _ = names.parts(runs.outcome)
-    return replace(
-        runs,
-        place=np.full(len(runs), place),
-        outcome=np.array([names.outcome(int(s), -1) for s in status], np.int64),
-        preempted=np.zeros(len(runs), np.bool_),
-        censored=runs.censored | runs.preempted,
-        seen=Seen.nothing(len(names.places), len(runs)),
-    )
+    """Return runs that stand for those of a place that no run entered, as they end by its own
+    deadline. Which transition took a run says nothing about another place: what preempted it cut it
+    off there."""
+    names, task = training.vocabulary, training.task
+    name = names.places[place]
+    lenders = siblings(training, name)
+
+    def lent(run: RunEntry) -> RunEntry:
+        status = "" if run.cancelled else run.status
+        own = replace(run, place=name, taken="", status=status, cancelled=False)
+        return ended_within(own, task.longest_run(run.place), task.longest_run(name))
+
+    trials = [
+        replace(trial, runs=[lent(run) for run in trial.runs if run.place in lenders])
+        for trial in training.trials
+    ]
+    runs = as_arrays(names, trials, training.devices)
+    runs = replace(runs, seen=Seen.nothing(len(names.places), len(runs)))
+    return changed(training, runs, training.changes)
 
 
 class RunDistributions:

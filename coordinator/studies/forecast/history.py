@@ -3,17 +3,18 @@ its trial."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.ordinary import contended
-from petrobot.coordinator.analysis.time.measured import is_cause
+from petrobot.coordinator.analysis.time.measured import LATE, is_cause
 from petrobot.coordinator.analysis.time.whatif import Change, in_range, statuses_of
 from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
 from petrobot.coordinator.learning.estimate import Tally
@@ -38,6 +39,8 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
+from petrobot.coordinator.task.conditions import Domain, Expression, equivalent
+from petrobot.coordinator.task.validation import condition_domains, marking_domains
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -204,6 +207,8 @@ class Training:
     same: bool = True
     """False if the trials are of an earlier form of the task: they tell of its runs, but not what
     whole trials come to."""
+    changes: Sequence[Change] = ()
+    """Other durations and shares than the trials have; `runs` has them already."""
 
     @property
     def repeats(self) -> bool:
@@ -242,7 +247,7 @@ class Training:
             task,
             vocabulary,
             kept,
-            _runs(vocabulary, kept, waiting),
+            as_arrays(vocabulary, kept, waiting),
             {name: known for name, known in found.items() if known is not None},
             whole,
             waiting,
@@ -299,18 +304,90 @@ def by_regime(
     }
 
 
-def of_this_form(task: Task, rows: Iterable[TrialRow]) -> list[TrialRow]:
-    """Return the rows of an earlier form of a task without the runs that the task no longer has:
-    those of other places, or of other actions."""
+_WORDS = frozenset({
+    "goal", "text", "specification", "error_causes", "pictures",  # for people
+    "label", "x", "y", "macro", "expanded_from", "error_branch",  # for drawings
+    "estimates", "mean_wait", "cost", "costs", "target_reliability",  # no run depends on them
+    "holds", "subnets", "errors_to",  # arcs of the flat task say the same
+})  # fmt: skip
+"""Fields of a task's elements that no trial depends on."""
+_IN_ANY_ORDER = frozenset({"inputs", "outputs", "inhibitors", "goal_transitions", "sets"})
+
+
+def same_form(ran: Task, now: Task) -> bool:
+    """Return whether trials of one task are trials of the other: their flat nets are equal, with
+    names, the order of places and transitions, services and parameters. Words, the drawing,
+    declared guesses, the order of arcs, and how a condition is written make no difference."""
+    before, after = _without_macros(ran.flat), _without_macros(now.flat)
+    marking, values = marking_domains(after), condition_domains(after)
+    return (
+        list(before.places) == list(after.places)
+        and list(before.transitions) == list(after.transitions)
+        and _alike(before, after, {**marking, **values})
+    )
+
+
+def _without_macros(flat: Task) -> Task:
+    return replace(flat, places={n: p for n, p in flat.places.items() if p.kind is not Kind.MACRO})
+
+
+def _alike(one: Any, other: Any, domains: Mapping[str, Domain]) -> bool:
+    if isinstance(one, Expression) and isinstance(other, Expression):
+        return equivalent(one, other, domains)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(_alike(one[k], other[k], domains) for k in one)
+    if not is_dataclass(one) or type(one) is not type(other):
+        return bool(one == other)
+    pairs = {
+        f.name: (getattr(one, f.name), getattr(other, f.name))
+        for f in fields(one)
+        if f.compare and f.name not in _WORDS
+    }
+    return all(
+        Counter(a) == Counter(b) if name in _IN_ANY_ORDER else _alike(a, b, domains)
+        for name, (a, b) in pairs.items()
+    )
+
+
+def of_this_form(task: Task, ran: Task | None, rows: Iterable[TrialRow]) -> list[TrialRow]:
+    """Return the rows of an earlier form of a task, `ran` if it is known, without the runs that the
+    task no longer has: those of other places, or of other actions. The others end by the deadlines
+    of the task as it is."""
+
+    def fitted(run: RunEntry) -> RunEntry:
+        before = ran is not None and ran.flat.places.get(run.place)
+        if ran is None or not before or before.kind is not Kind.ACTION:
+            return run
+        return ended_within(run, ran.longest_run(run.place), task.longest_run(run.place))
+
     return [
         row
         if row.trial is None
         else replace(
             row,
-            trial=replace(row.trial, runs=[run for run in row.trial.runs if _has(task.flat, run)]),
+            trial=replace(
+                row.trial, runs=[fitted(run) for run in row.trial.runs if _has(task.flat, run)]
+            ),
         )
         for row in rows
     ]
+
+
+def ended_within(run: RunEntry, before: float, limit: float) -> RunEntry:
+    """Return a run that a place ended after `before` s at the latest, as it is known of a place
+    that ends runs after `limit` s. One that was ended earlier would have continued: it is cut
+    off. One that took longer ends in ERROR then."""
+    late = run.cause == LATE[0] and not run.cancelled
+    if late and before < limit:
+        return replace(run, status="", cause="", taken="")
+    over = (before if late else run.seconds) - limit
+    if before == limit or over <= 0.0:
+        return run
+    took, seconds = max(0.0, run.took - over), max(0.0, run.seconds - over)
+    return replace(
+        run, took=took, seconds=seconds, status=Status.ERROR.value, cause=LATE[0], taken="",
+        cancelled=False,
+    )  # fmt: skip
 
 
 def _has(flat: Task, run: RunEntry) -> bool:
@@ -350,7 +427,10 @@ def _waited(timer: str, trial: Trial) -> list[float]:
     return out
 
 
-def _runs(vocabulary: RunVocabulary, trials: tuple[Trial, ...], waiting: Mapping[str, str]) -> Runs:
+def as_arrays(
+    vocabulary: RunVocabulary, trials: Sequence[Trial], waiting: Mapping[str, str]
+) -> Runs:
+    """Return the runs of trials. `waiting`: by action the device for which its runs may wait."""
     places = {name: i for i, name in enumerate(vocabulary.places)}
     actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
     flat = [(i, run) for i, trial in enumerate(trials) for run in trial.runs if run.place in places]
@@ -415,14 +495,14 @@ def reads_variables(t: Transition) -> bool:
 # --- what if ---
 
 
-def change_runs(training: Training, changes: Sequence[Change]) -> Training:
-    """Return a training in which actions last longer or shorter, or end otherwise more often.
+def changed(training: Training, runs: Runs, changes: Sequence[Change]) -> Runs:
+    """Return runs in which actions last longer or shorter, or end otherwise more often.
 
     A run that was cut off is scaled as a successful one is: it would have been active for so long
     at least. What an event or a timer preempted, and what was ended at its deadline, keeps its
     time and its share. Raises NetFileError.
     """
-    task, names, runs = training.task, training.vocabulary, training.runs
+    task, names = training.task, training.vocabulary
     scale: dict[tuple[int, int, int], float] = {}
     shares: dict[tuple[int, int], dict[Status, Change]] = {}
     for change in changes:
@@ -437,21 +517,21 @@ def change_runs(training: Training, changes: Sequence[Change]) -> Training:
             if task.primitive_task_of(place).name == primitive.name
             for action in actions
         ]
-        if not any(_of(runs, *cell).any() for cell in cells):
+        if runs is training.runs and not any(_of(runs, *cell).any() for cell in cells):
             raise change.fault("no such run was measured", "train with trials that get there")
         for q, action in cells:
             if change.subject[-1] == "share":
                 shares.setdefault((q, action), {})[statuses[0]] = change
             for status in statuses if change.subject[-1] == "mean" else ():
                 key = q, action, STATUSES.index(status)
-                own = runs.took[_ends_so(training, *key)]
+                own = runs.took[_ends_so(training, runs, *key)]
                 if len(own):
                     mean = float(own.mean()) * scale.get(key, 1.0)
                     scale[key] = scale.get(key, 1.0) * in_range(change, mean) / mean
     weight = runs.weight.copy()
     for (q, action), wanted in shares.items():
-        _weigh(training, q, action, wanted, weight)
-    return replace(training, runs=replace(_scaled(training, scale), weight=weight))
+        _weigh(training, runs, q, action, wanted, weight)
+    return replace(_scaled(training, runs, scale), weight=weight)
 
 
 def _of(runs: Runs, place: int, action: int) -> NDArray[np.bool_]:
@@ -459,17 +539,18 @@ def _of(runs: Runs, place: int, action: int) -> NDArray[np.bool_]:
     return found
 
 
-def _statuses(training: Training) -> Codes:
+def _statuses(training: Training, runs: Runs) -> Codes:
     """Return the status code of each run; CENSORED for those that were cut off."""
-    status, _ = training.vocabulary.parts(training.runs.outcome)
-    return np.where(training.runs.censored, CENSORED, status)
+    status, _ = training.vocabulary.parts(runs.outcome)
+    return np.where(runs.censored, CENSORED, status)
 
 
-def _ends_so(training: Training, place: int, action: int, status: int) -> NDArray[np.bool_]:
+def _ends_so(
+    training: Training, runs: Runs, place: int, action: int, status: int
+) -> NDArray[np.bool_]:
     """Return which runs of an action in a place ended by themselves with a status, in time."""
-    runs = training.runs
     own = _of(runs, place, action)
-    own &= ~runs.preempted & (_statuses(training) == status)
+    own &= ~runs.preempted & (_statuses(training, runs) == status)
     if STATUSES[status] is Status.ERROR:
         own &= runs.took < at_deadline(training, place, runs.of(own))[0]
     return own
@@ -478,49 +559,53 @@ def _ends_so(training: Training, place: int, action: int, status: int) -> NDArra
 def at_deadline(training: Training, place: int, runs: Runs) -> tuple[float, int]:
     """Return after how long a run in a place is ended at the latest (s), and its outcome then: the
     usual one of those of its runs that ended with ERROR."""
-    names, task = training.vocabulary, training.task
-    name, error = names.places[place], STATUSES.index(Status.ERROR)
-    timeout, deadline = task.flat.places[name].timeout, task.primitive_task_of(name).deadline
+    names, error = training.vocabulary, STATUSES.index(Status.ERROR)
     ended = runs.outcome[(runs.outcome > CUT) & (names.parts(runs.outcome)[0] == error)]
     outcome = int(np.bincount(ended).argmax()) if len(ended) else names.outcome(error, -1)
-    return min(deadline, np.inf if timeout is None else timeout), outcome
+    return training.task.longest_run(names.places[place]), outcome
 
 
 def _weigh(
-    training: Training, place: int, action: int, wanted: Mapping[Status, Change], weight: Values
+    training: Training,
+    runs: Runs,
+    place: int,
+    action: int,
+    wanted: Mapping[Status, Change],
+    weight: Values,
 ) -> None:
     """Give the runs of an action in a place weights with which statuses have their wanted shares of
     all runs that began. Raises NetFileError."""
-    began = _of(training.runs, place, action)
+    began = _of(runs, place, action)
     if not began.any():
         return
     rest, left = began.copy(), 1.0
     for status, change in wanted.items():
-        own = _ends_so(training, place, action, STATUSES.index(status))
+        code = STATUSES.index(status)
+        own = _ends_so(training, runs, place, action, code)
         share = in_range(change, old := own.sum() / began.sum())
         if share and not old:
             name = training.vocabulary.places[place]
             raise change.fault(f"no run in {name} ended so: nothing is known of its duration")
         weight[own] = share / old if old else 1.0
-        if status is Status.ERROR:
-            late = rest & (_statuses(training) == STATUSES.index(status)) & ~own
-            rest &= ~late
-            left -= late.sum() / began.sum()
         rest &= ~own
         left -= share
+        if status is Status.ERROR:
+            late = rest & (_statuses(training, runs) == code)
+            rest &= ~late
+            left -= late.sum() / began.sum()
     if left < -1e-9 or (left > 1e-9 and not rest.any()):
         raise change.fault("the shares of an action do not add up to 1")
     weight[rest] = max(0.0, left) * began.sum() / max(1, rest.sum())
 
 
-def _scaled(training: Training, scale: Mapping[tuple[int, int, int], float]) -> Runs:
+def _scaled(training: Training, runs: Runs, scale: Mapping[tuple[int, int, int], float]) -> Runs:
     """Return the runs with scaled durations, also where others were begun after them: what depends
     on how long a run took, depends on how it compares with the others."""
-    names, runs = training.vocabulary, training.runs
+    names = training.vocabulary
     took, seen, outcome = runs.took.copy(), runs.seen.took.copy(), runs.outcome.copy()
     earlier, _ = names.parts(runs.seen.outcome)
     for (q, action, code), factor in scale.items():
-        own = _ends_so(training, q, action, code)
+        own = _ends_so(training, runs, q, action, code)
         before = (runs.seen.action[q] == action) & (earlier[q] == code)
         if STATUSES[code] is Status.SUCCESS:
             own |= _of(runs, q, action) & runs.censored

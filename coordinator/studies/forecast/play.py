@@ -191,6 +191,8 @@ class Play:
         self._turns = 0
         self._seen = Seen.nothing(len(places), n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
+        self._taken = np.zeros(n, np.bool_)
+        """Whether the run token was taken. A trial takes it once: given back, it ends the trial."""
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
         self._ends: dict[Marking, int] = {}
         self._out = Played(
@@ -301,6 +303,8 @@ class Play:
 
     def _enabled(self, m: Move) -> Mask:
         out = concession(self._s.rule, self._tokens, m.number)
+        if m.takes_run:
+            out &= ~self._taken
         for arc in m.transition.actions:
             fitting = [self._fits(m, arc, r) for r in self._runs_of(arc)]
             out &= sum(fitting[1:], fitting[0].astype(np.int64)) >= arc.weight
@@ -376,7 +380,7 @@ class Play:
             ways = self._ways.setdefault(arc.name, {})
             ways[m.name] = ways.get(m.name, 0) + rows.size
         if m.takes_run:
-            self._begun[columns] = self._now[columns]
+            self._begun[columns], self._taken[columns] = self._now[columns], True
         self._goals[columns] += m.is_goal
         for place, weight, is_action in m.transition.produce:
             if is_action:
@@ -596,11 +600,12 @@ class Play:
         verdicts = np.array(
             [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
         )
+        back = self._taken & (self._tokens == self._s.initial[:, None]).all(axis=0)
         awaited = self._awaited[self._place]
         phase, want = self._phase[awaited], self._want[awaited]
         # an ended one whose measured transition is not enabled goes another way first: `_free`
         busy = ((phase == GOING) | ((phase == DONE) & (want >= 0))).any(axis=0)
-        return np.where(busy, 0, verdicts[inverse.ravel()])
+        return np.where(busy, 0, np.where(back, 1, verdicts[inverse.ravel()]))
 
     def _keys(self) -> Codes:
         """One number for each column's marking: its digits in a base above every count of
@@ -630,7 +635,7 @@ class Play:
         self._out.time[own] = np.where(done, self._now[over] - self._begun[over], np.nan)
         kept = ~over
         self._seen = self._seen.of(kept)
-        for name in ("_column", "_replicate", "_now", "_begun", "_goals", "_good"):
+        for name in ("_column", "_replicate", "_now", "_begun", "_taken", "_goals", "_good"):
             setattr(self, name, getattr(self, name)[kept])
         for name in (*_BY_RUN, "_tokens", "_due", "_since"):
             setattr(self, name, getattr(self, name)[:, kept])

@@ -4,7 +4,7 @@ the simulated net; and the product rule for comparison."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from petrobot.coordinator.studies.forecast.distributions import (
     dependences,
     siblings,
 )
-from petrobot.coordinator.studies.forecast.history import Codes, Training, Values, change_runs
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values, changed
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
@@ -41,6 +41,7 @@ from petrobot.coordinator.studies.forecast.residual import (
     durations,
     entered,
     event_doubts,
+    limit_doubts,
     measured,
     order_doubts,
     parallel_doubts,
@@ -324,7 +325,8 @@ def _from_net(
     net = _SimulatedNet(training)
     residual = residuals(training, net.replayed(request.seed)) if training.repeats else []
     if request.changes or asked:
-        net = _SimulatedNet(change_runs(training, request.changes), asked)
+        runs = changed(training, training.runs, request.changes)
+        net = _SimulatedNet(replace(training, runs=runs, changes=request.changes), asked)
     whole = net.once(request.choices, request.point, random)
     samples = net.bootstrap(request, random)
     point, n = figures(whole), len(training.trials)
@@ -343,6 +345,7 @@ def _from_net(
             *event_doubts(training),
             *condition_doubts(training, net.structure.moves),
             *parallel_doubts(training),
+            *limit_doubts(training),
             *order_doubts(training),
             *rare_doubts(training, np.ones(n), told),
         ],

@@ -19,9 +19,10 @@ from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, trial_forecast
 from petrobot.coordinator.analysis.time.whatif import Change, change_task
+from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.propagation import ChoiceShares, measured_from
-from petrobot.coordinator.studies.campaign.observed import context_of
+from petrobot.coordinator.learning.propagation import ChoiceShares, limits_of, measured_from
+from petrobot.coordinator.studies.campaign.observed import context_of, observation
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, predict
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
@@ -70,7 +71,13 @@ def register(
                 regimes[name]["what_if"] = [change.text for change in request.changes]
             if estimates is not None:
                 regimes[name]["gspn"] = exact(
-                    task, estimates, name, request.choices, cell, request.changes
+                    task,
+                    estimates,
+                    name,
+                    request.choices,
+                    cell,
+                    apart=by_place(trainings[name]),
+                    changes=request.changes,
                 )
         except ValueError as fault:
             raise ForecastError(f"regime {name or '-'}: {fault}") from fault
@@ -141,9 +148,12 @@ def exact(
     regime: str,
     choice: ChoiceShares,
     cell: Cell | None = None,
+    *,
+    apart: Mapping[str, Mapping[str, Tally]] | None = None,
     changes: Sequence[Change] = (),
 ) -> dict[str, Any]:
     """Return the figures of the stochastic view for one trial; only `why` if it cannot be solved.
+    `apart` as for `measured_from`.
 
     `P_complete_interval` contains what the estimates leave open (see `_share_error`),
     `P_complete_error` what the solution does (relative). Its times begin when the run token is
@@ -152,7 +162,7 @@ def exact(
     context = context_of(regime)
     try:
         devices = devices_of(cell)
-        known = measured_from(task, estimates, context, choice, devices=devices)
+        known = measured_from(task, estimates, context, choice, devices=devices, apart=apart)
         unentered = _unentered(task, known)
         known = replace(known, runs={**known.runs, **unentered})
         task, known = change_task(task, known, changes)
@@ -177,13 +187,35 @@ def exact(
         "q90": q90,
         "P_complete_error": found.completion_error,
     }
+    again = [
+        f"{t.name} gives the run token back: this view takes it again, and the trial continues; a "
+        "measured one ends there"
+        for t in task.flat.transitions.values()
+        if any(out.place == task.runs_place for out in t.outputs) and found.firings[t.name] > 0.0
+    ]
     # digits, not decimals: a probability of 1e-6 keeps its own
     return {
         **{k: None if v is None else float(f"{v:.7g}") for k, v in numbers.items()},
-        "P_complete_interval": _share_error(task, estimates, context, found),
+        "P_complete_interval": _share_error(task, estimates, context, found, apart or {}),
         "markings": found.chain.n,
-        "notes": list(found.later),
+        "notes": [*again, *found.later],
     }
+
+
+def by_place(training: Training) -> dict[str, dict[str, Tally]]:
+    """Return the tally of each action in each place that ends its runs after another time than
+    others of its primitive task; empty for an estimates file, which has no places."""
+    flat, out = training.task.flat, dict[str, dict[str, Tally]]()
+    own = {
+        place.name
+        for place in flat.places.values()
+        if place.kind is Kind.ACTION and len(limits_of(flat, place.task)) > 1
+    }
+    for run in (r for t in training.trials for r in t.runs if training.whole and r.place in own):
+        tallies = out.setdefault(run.place, {})
+        tally = tallies.get(run.action, Tally())
+        tallies[run.action] = tally.adding(observation(flat, run), str(tally.changes))
+    return out
 
 
 def _unentered(task: Task, known: Measured) -> dict[tuple[str, str], dict[Status, Estimate]]:
@@ -214,7 +246,11 @@ def _refuse_guesses(task: Task, found: Forecast, unentered: Mapping[tuple[str, s
 
 
 def _share_error(
-    task: Task, estimates: Estimates, context: str | None, found: Forecast
+    task: Task,
+    estimates: Estimates,
+    context: str | None,
+    found: Forecast,
+    apart: Mapping[str, Mapping[str, Tally]],
 ) -> list[float] | None:
     """Return the 95 % interval of P_complete that the measured shares of statuses leave.
 
@@ -231,15 +267,15 @@ def _share_error(
     moves: dict[tuple[str, str], dict[Status, list[float]]] = {}
     for label, end in found.view.statuses.items():
         place, action, status = end
-        primitive = task.primitive_task_of(place).name
-        # Places with the same primitive task share its runs; the branches of a duration share the
-        # runs of its status.
-        own = moves.setdefault((primitive, action), {}).setdefault(status, [0.0, 0.0])
+        where = place if action in apart.get(place, ()) else task.primitive_task_of(place).name
+        # Places with the same primitive task share its runs, if all end them after the same time;
+        # the branches of a duration share the runs of its status.
+        own = moves.setdefault((where, action), {}).setdefault(status, [0.0, 0.0])
         own[0] += slopes[label].derivative * slopes[label].value / shares[end]
         own[1] = shares[end]
-    for (primitive, action), by_status in moves.items():
-        tallies = estimates.of(primitive, context).get(action, {})
-        runs = sum(t.runs for t in tallies.values())
+    for (where, action), by_status in moves.items():
+        tallies = estimates.of(where, context).get(action, {}).values()
+        runs = apart[where][action].runs if where in apart else sum(t.runs for t in tallies)
         if runs:
             first = sum(d * q for d, q in by_status.values())
             variance += (sum(q * d * d for d, q in by_status.values()) - first**2) / runs

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind_from_stats
 
 from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
+from petrobot.coordinator.learning.propagation import limits_of
 from petrobot.coordinator.learning.records import WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.direct import FEWEST, holm, missions
@@ -362,7 +363,9 @@ def _branches(training: Training) -> dict[str, set[int]]:
 
 def event_doubts(training: Training) -> list[str]:
     """Return in words which events the simulated net cannot follow: where no single wait can be
-    repeated, it knows the rate of one event for each transition."""
+    repeated, it knows the rate of one event for each transition. Where waits were measured, each
+    transition has its own, which matters if they share an event; the training trials show how much,
+    if they can be compared."""
     flat = training.task.flat
     never = exclusive_places(flat.net, place_semiflows(flat.net))
     place = flat.net.place_index
@@ -376,11 +379,12 @@ def event_doubts(training: Training) -> list[str]:
                 "had come by then is not known"
             )
         known = training.waits.get(t.name)
-        if known is None or known.came is None or remembered is None:
+        by_rate = known is not None and known.came is not None
+        if remembered is None or (training.repeats and not by_rate):
             continue
         memory, early = remembered
         for u in flat.transitions.values():
-            apart = early is EarlyEvent.DROP and any(
+            apart = (early is EarlyEvent.DROP or not by_rate) and any(
                 tuple(sorted((place[a.place], place[b.place]))) in never
                 for a in t.inputs
                 for b in u.inputs
@@ -389,10 +393,10 @@ def event_doubts(training: Training) -> list[str]:
                 u is not t
                 and {*t.events} & {*u.events}
                 and not apart
-                and not (memory is EventMemory.LATCHED and _by_rate(training, u))
+                and not (by_rate and memory is EventMemory.LATCHED and _by_rate(training, u))
             ):
                 together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
-        if memory is EventMemory.LATCHED and reads_variables(t):
+        if by_rate and memory is EventMemory.LATCHED and reads_variables(t):
             out.append(
                 f"{t.name} waits for a latched event and reads variables, which the simulated net "
                 "does not know"
@@ -400,8 +404,8 @@ def event_doubts(training: Training) -> list[str]:
     for event, waiting in together.items():
         *some, last = waiting
         out.append(
-            f"{', '.join(some)} and {last} wait for one event, {event}, and their waits were "
-            "interrupted: the simulated net lets it come for each of them by itself"
+            f"{', '.join(some)} and {last} wait for one event, {event}, maybe together: the "
+            "simulated net lets it come for each of them by itself"
         )
     return out
 
@@ -447,6 +451,21 @@ def parallel_doubts(training: Training) -> list[str]:
         + f" may be active at the same time{more}, and an estimates file does not tell whether "
         "they are slow, or fail, together; give a campaign's folder"
         for p, q in together[:1]
+    ]
+
+
+def limit_doubts(training: Training) -> list[str]:
+    """Return in words which places end runs of one primitive task after different times, if the
+    training is an estimates file, which counts them together."""
+    if training.whole:
+        return []
+    flat = training.task.flat
+    return [
+        f"{' and '.join(p for p in training.vocabulary.places if flat.places[p].task == primitive)}"
+        f" end runs of {primitive} after different times ({', '.join(f'{s:g} s' for s in limits)}),"
+        " and an estimates file counts these runs together; give a campaign's folder"
+        for primitive in flat.primitive_tasks
+        if len(limits := sorted(limits_of(flat, primitive))) > 1
     ]
 
 

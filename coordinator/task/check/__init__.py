@@ -9,6 +9,7 @@ from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.check.completeness import (
     event_faults,
     external_waits,
+    impossible,
     translating_others,
     uncovered_exits,
     unoffered,
@@ -147,6 +148,7 @@ def unused(task: Task) -> Iterator[Finding]:
 
 _CHECKS: tuple[Callable[[Task], Iterator[Finding]], ...] = (
     uncovered_exits,
+    impossible,
     event_faults,
     conflicts,
     timeless_cycles,

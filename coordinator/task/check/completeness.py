@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import inf
 
 from petrobot.coordinator.task import (
     EarlyEvent,
@@ -19,7 +20,7 @@ from petrobot.coordinator.task import (
     Transition,
 )
 from petrobot.coordinator.task.check.findings import Finding
-from petrobot.coordinator.task.conditions import Expression
+from petrobot.coordinator.task.conditions import Expression, equivalent, parse
 from petrobot.coordinator.task.conditions.regions import Certainty, Domain, covering
 from petrobot.coordinator.task.validation import condition_domains
 from petrobot.coordinator.task.wording import Severity, listed, nearest
@@ -94,6 +95,29 @@ def _reads_other(way: Transition, place: Place, domains: Mapping[str, Domain]) -
     names = () if way.when is None else way.when.names
     owners = {name.rpartition(".")[0] for name in names if name in domains}
     return not owners <= {"", place.name}
+
+
+# Transitions that can never fire, whatever the rest of the task does.
+
+
+def impossible(task: Task) -> Iterator[Finding]:
+    """Find conditions that no values make true, and timers of runs that end before them."""
+    domains, never = condition_domains(task), parse("false")
+    for t in task.transitions.values():
+        key = f"transitions.{t.name}"
+        if t.when is not None and t.when.names and equivalent(t.when, never, domains):
+            text, remedy = "no values make it true", "write a condition that can hold"
+            yield Finding(Severity.ERROR, "never-true", f"{key}.when", text, remedy)
+        for arc in t.inputs if t.after is not None else ():
+            limit = task.longest_run(arc.place) if arc.end in (End.PREEMPT, End.GOING) else inf
+            if t.after is not None and t.after > limit:
+                text = (
+                    f"it needs a run of {arc.place} that is active for {t.after:g} s, but these "
+                    f"end in ERROR after {limit:g} s (cause `deadline`), or as much later as they "
+                    "wait before they start"
+                )
+                remedy = "write a shorter `after`, or give the runs more time"
+                yield Finding(Severity.WARNING, "late-timer", f"{key}.after", text, remedy)
 
 
 # Events that no transition can receive, and waits that only the outside world can end.

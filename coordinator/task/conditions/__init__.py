@@ -21,6 +21,7 @@ from petrobot.coordinator.task.conditions.regions import (
     Domain,
     Judgement,
     covering,
+    equivalent,
     exclusive,
     kind_faults,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "Or",
     "Severity",
     "covering",
+    "equivalent",
     "exclusive",
     "kind_faults",
     "parse",

@@ -86,6 +86,19 @@ def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Doma
     return _decide(conditions, domains, lambda truths: not any(truths))
 
 
+def equivalent(one: Expression, other: Expression, domains: Mapping[str, Domain]) -> bool:
+    """Return whether two conditions are true for the same values; `none` is one of them, as nothing
+    need have been written yet. Above `LIMIT` assignments only equal texts are."""
+    if one == other:
+        return True
+    choices = {n: [*c, None] for n, c in region_values([one, other], domains).items()}
+    return prod(len(c) for c in choices.values()) <= LIMIT and all(
+        _holds(one, values) == _holds(other, values)
+        for some in product(*choices.values())
+        for values in [dict(zip(choices, some, strict=True))]
+    )
+
+
 def _decide(
     conditions: Sequence[Expression | None], domains: Mapping[str, Domain], bad: Any
 ) -> Judgement:

@@ -222,11 +222,25 @@ def test_a_task_that_was_changed_is_forecast_by_the_simulated_net(
     write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The trials are of another form: they tell of its runs, but no figure comes straight from
-    them. A file that differs in words only, or in the number of runs, is the same task."""
+    them. A file that differs in words, guesses, the order of arcs, the wording of a condition or
+    the number of runs is the same task."""
     train = write_campaign("train", TASK, make_trials(200, np.random.default_rng(1), actions=BOTH))
     forms = {
         "words": "# another comment\n" + TASK.replace("tokens = 4", "tokens = 7"),
+        "texts": TASK.replace('goal = "done"', 'goal = "it is there"\nspecification = "seen"')
+        .replace("mean_wait = 1.0", 'mean_wait = 2.0\ntext = "a lamp"')
+        .replace('name = "pair"', 'name = "pair"\ngoal = "all jobs done"'),
+        "same end": TASK.replace(
+            '"jobs == 0 and free == 1"', '"not (free  != 1 or jobs > 0) and true"'
+        ),
+        "order of arcs": TASK.replace('["jobs", "free"]', '["free", "jobs"]'),
+        "in short": TASK.replace('task = "first"', 'task = "first"\nholds = ["free"]')
+        .replace('in = ["jobs", "free"]', 'in = ["jobs"]')
+        .replace('task = "second"', 'task = "second"\nholds = ["free"]')
+        .replace('out = ["free"]', "out = []"),
         "slower": TASK.replace("deadline = 9.0", "deadline = 8.0"),
+        "other end": TASK.replace('"jobs == 0 and free == 1"', '"jobs <= 1 and free == 1"'),
+        "other goal": TASK.replace('["done"]', '["missed"]'),
         "one action": TASK.replace('"first_a", ', ""),
         "another place": TASK.replace("second", "third"),
     }
@@ -238,7 +252,13 @@ def test_a_task_that_was_changed_is_forecast_by_the_simulated_net(
         found[name] = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
     assert {name: (said["from"], said["same"]) for name, said in found.items()} == {
         "words": ("trials", True),
+        "texts": ("trials", True),
+        "same end": ("trials", True),
+        "order of arcs": ("trials", True),
+        "in short": ("trials", True),
         "slower": ("net", False),
+        "other end": ("net", False),
+        "other goal": ("net", False),
         "one action": ("net", False),
         "another place": ("net", False),
     }
@@ -286,6 +306,104 @@ gone: again:error -> free
     ]
     assert said["figures"]["R_goal"]["value"] == pytest.approx(0.84, abs=0.02)
     assert said["figures"]["mean"]["value"] == pytest.approx(0.6 * 2 + 0.4 * 2 + 0.24, abs=0.05)
+
+
+LIMITS = with_transitions("""
+schema = 1
+[task]
+name = "limits"
+final = "jobs == 0 and free == 1"
+goal_transitions = ["done"]
+runs_place = "jobs"
+[primitive_tasks.move]
+deadline = 9.0
+[places.jobs]
+kind = "control"
+tokens = 4
+[places.free]
+kind = "resource"
+tokens = 1
+[places.fetch]
+kind = "action"
+task = "move"
+timeout = 3.0
+[places.bring]
+kind = "action"
+task = "move"
+begin: jobs, free -> fetch
+on: fetch:normal -> bring
+late: fetch:error -> free
+done: bring:normal -> free
+lost: bring:error -> free
+""")
+"""Two places of one primitive task that end its runs after 3 and 9 s."""
+
+
+def _moved(k: int) -> Trial:
+    """Return a trial of `LIMITS`; each run takes 1, 2, 3, 4 or 5 s, if nothing ends it."""
+    first, second = 1.0 + k % 5, 1.0 + (k // 5) % 5
+    runs = [
+        RunEntry("fetch", "move", 0.0, first, "success", seconds=first, taken="on"),
+        RunEntry("bring", "move", first, second, "success", seconds=second, taken="done"),
+    ]
+    if first > 3.0:
+        runs = [RunEntry("fetch", "move", 0.0, 3.0, "error", "deadline", seconds=3.0, taken="late")]
+    return Trial(1, 0.0, sum(r.took for r in runs), True, len(runs) - 1, runs=runs)
+
+
+@pytest.mark.parametrize(
+    ("change", "goals", "exact", "doubtful"),
+    [
+        (("schema", "schema"), 0.6, 0.6, False),
+        (("timeout = 3.0", "timeout = 2.0"), 0.4, 0.4, False),
+        (("deadline = 9.0", "deadline = 3.5"), 0.6 * 0.6, 0.6 * 0.6, False),
+        (("timeout = 3.0", "timeout = 6.0"), None, None, True),
+        (('[places.bring]\nkind = "action"', '[places.other]\nkind = "action"\ntimeout = 2.5'),
+         0.6 * 0.4, None, False),
+        # a run token that is given back ends its trial
+        (('in = ["fetch:error"]\nout = ["free"]', 'in = ["fetch:error"]\nout = ["free", "jobs"]'),
+         0.6, None, False),
+    ],
+)  # fmt: skip
+def test_a_changed_deadline_ends_the_runs_that_were_measured(
+    change: tuple[str, str],
+    goals: float | None,
+    exact: float | None,
+    doubtful: bool,
+    write_campaign: Write,
+    tmp_path: Path,
+) -> None:
+    """Also runs that stand for those of a place that no run entered. The exact solution does not
+    mix places that end runs after different times. What a shorter deadline cut off is a guess."""
+    train = write_campaign("train", LIMITS, [_moved(k) for k in range(500)])
+    path, out = tmp_path / "given.toml", tmp_path / "forecast.json"
+    changed = LIMITS.replace(*change)
+    if "other" in changed:
+        changed = changed.replace('"bring', '"other')
+    path.write_text(changed, encoding="utf-8")
+    main(["forecast", str(path), "--estimates", str(train), *QUICK, "--json", str(out)])
+    said = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
+    assert any("lasts longer than any measured one" in d for d in said["doubts"]) is doubtful
+    if goals is not None:
+        assert said["figures"]["R_goal"]["value"] == pytest.approx(goals, abs=0.02)
+    if exact is not None:
+        assert said["gspn"]["R_goal"] == pytest.approx(exact, abs=1e-6)
+
+
+def test_an_estimates_file_does_not_tell_places_with_different_deadlines_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from petrobot.coordinator.studies.campaign.observed import estimates_of, write_estimates
+
+    task, own = loads(LIMITS, "limits.toml"), tmp_path / "limits.toml"
+    rows = [TrialRow(i, "", i, 1, i, 1.0, _moved(i)) for i in range(500)]
+    path = write_estimates(tmp_path, estimates_of(task, rows, "t"), {}, "t")
+    own.write_text(LIMITS, encoding="utf-8")
+    assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 1
+    shown = " ".join(capsys.readouterr().out.split())
+    assert (
+        "DOUBTFUL: fetch and bring end runs of move after different times (3 s, 9 s), and" in shown
+    )
 
 
 def test_estimates_of_another_task_are_refused(
