@@ -8,6 +8,7 @@ import logging
 import os
 import secrets
 import signal
+import socket
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -19,7 +20,7 @@ from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.link import Alarm, clock_of
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import Directory, DirectoryError, sources
-from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
+from petrobot.services.comm.location_file.host_checks import claim, listening
 from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.comm.protocol.security import all_keys, require_key
 from petrobot.services.comm.tls.credentials import credentials
@@ -89,6 +90,7 @@ class NodeShell:
         self._beating: asyncio.TimerHandle | None = None
         self._change = asyncio.Event()
         self._serving = False
+        self._claim: socket.socket | None = None
 
     def _devices(self) -> list[str]:
         devices = [d.name for d in self._directory.devices.values() if d.node == self._name]
@@ -115,7 +117,7 @@ class NodeShell:
         the address cannot be used, and KeyNeededError."""
         host, port = self._directory.address(self._name)
         require_key(self._name, host, self._credentials.guarded)
-        refuse_unusable(self._directory, self._name)
+        self._claim = claim(self._directory, self._name)
         try:
             for place in self._workers.values():
                 place.start()
@@ -172,6 +174,8 @@ class NodeShell:
                 "%d processes hang in the kernel and are left to their keepers", len(hanging)
             )
         self._alarm.cancel()
+        if self._claim is not None:
+            self._claim.close()
 
     # --- steps --------------------------------------------------------------------------------
 
