@@ -151,6 +151,7 @@ def latch_of(source: Path, node: str) -> Latch:
 
 def _read(path: Path) -> frozenset[str]:
     try:
+        path.stat()  # needs no file descriptor: without a free one, a missing file is still missing
         names = path.read_text(encoding="utf-8").split()
     except FileNotFoundError:
         return frozenset()

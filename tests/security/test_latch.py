@@ -55,6 +55,21 @@ def test_a_damaged_latch_stops_everything(tmp_path: Path, content: bytes | None)
     assert stops.at_start() == list(DEVICES)
 
 
+def test_a_process_without_free_descriptors_stops_nothing_without_a_latch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As under a flood of connections: that is no emergency stop."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr("io.open", refuse)
+    assert latch(tmp_path).stopped() == frozenset()
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "motion.stopped").touch()
+    assert latch(tmp_path).stopped() == {ALL}, "in doubt it is stopped"
+
+
 def test_the_second_folder_is_used_if_the_first_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "first").mkdir()
     (tmp_path / "first" / "motion.stopped").mkdir()  # nothing can replace it
