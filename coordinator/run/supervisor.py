@@ -198,7 +198,10 @@ class Supervisor:
                 if loop.time() - started > STABLE_AFTER
                 else min(2 * pause, LONGEST_PAUSE)
             )
-            _log.warning("node %s died; starting it again in %g s", child.program.name, pause)
+            name = child.program.name
+            _log.warning(
+                "node %s died; its log is %s; starting it again in %g s", name, child.log, pause
+            )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._over.wait()

@@ -8,7 +8,6 @@ import logging
 import os
 import secrets
 import signal
-import socket
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -26,7 +25,7 @@ from petrobot.services.comm.protocol.security import all_keys, require_key
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
-from petrobot.services.node.child import LEAVE_LIMIT
+from petrobot.services.node.child import LEAVE_LIMIT, ForkServer
 from petrobot.services.node.emergency_stops import BEAT_EVERY
 from petrobot.services.node.inline_host import Host
 from petrobot.services.node.node import GENERAL, LOOP, Node, stream_service
@@ -90,7 +89,6 @@ class NodeShell:
         self._beating: asyncio.TimerHandle | None = None
         self._change = asyncio.Event()
         self._serving = False
-        self._claim: socket.socket | None = None
 
     def _devices(self) -> list[str]:
         devices = [d.name for d in self._directory.devices.values() if d.node == self._name]
@@ -117,7 +115,6 @@ class NodeShell:
         the address cannot be used, and KeyNeededError."""
         host, port = self._directory.address(self._name)
         require_key(self._name, host, self._credentials.guarded)
-        self._claim = claim(self._directory, self._name)
         try:
             for place in self._workers.values():
                 place.start()
@@ -174,8 +171,6 @@ class NodeShell:
                 "%d processes hang in the kernel and are left to their keepers", len(hanging)
             )
         self._alarm.cancel()
-        if self._claim is not None:
-            self._claim.close()
 
     # --- steps --------------------------------------------------------------------------------
 
@@ -288,6 +283,10 @@ async def serve(directory: Directory, name: str, text: str, *, mock: str, memory
     loop = asyncio.get_running_loop()
     if wanted_with_parent():
         _end_with_launcher(os.getppid(), over)
+    # Its children keep it open, too: while the driver's process of a killed node stops its device,
+    # the node's successor must not make a second driver.
+    claimed = claim(directory, name)
+    ForkServer.kept_open = (claimed.fileno(),)
     shell = NodeShell(directory, name, text, mock=mock, memory=memory)
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, over.set)
