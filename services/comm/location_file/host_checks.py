@@ -254,9 +254,9 @@ def listening(directory: Directory, node: str) -> Iterator[None]:
         raise DirectoryError((f"{directory.source}: {text}",)) from fault
 
 
-CLAIM_LIMIT = 10.0
-"""How long a node waits for another process of its address that does not listen (s): as long as
-that may take to end."""
+CLAIM_LIMIT = 15.0
+"""How long a node waits for another process of its address that does not listen (s): longer than
+that may take to end (GOOD_ORDER and STOP_ROUTINE in `parent_death.py`)."""
 
 
 def claim(directory: Directory, node: str) -> socket.socket:
