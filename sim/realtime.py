@@ -33,7 +33,7 @@ from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.canopen.byte_stream import CanHub
 from petrobot.services.comm.location_file import Directory, resolve
-from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
+from petrobot.services.comm.location_file.host_checks import claim, listening
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.comm.streams.camera import ImageServer
@@ -380,9 +380,8 @@ def camera_address(directory: Directory) -> tuple[str, int] | None:
 
 async def serve(directory: Directory, name: str) -> None:
     """Run the laboratory until SIGTERM or SIGINT; print one line with `ready` when it serves."""
-    refuse_unusable(
-        directory, name
-    )  # A second laboratory should be reported at its node's address, not at that of its bus.
+    # A second laboratory should be reported at its node's address, not at that of its bus.
+    claimed = claim(directory, name)
     shell = LaboratoryShell(directory, name)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -393,3 +392,4 @@ async def serve(directory: Directory, name: str) -> None:
     await shell.over.wait()
     _log.info("node %s ends", name)
     await shell.close()
+    claimed.close()

@@ -150,4 +150,7 @@ def _show(
     if coordinator:
         print(coordinator)
     if not options.clear:
-        print("`petrobot estop --clear` lets the devices accept commands again")
+        print(
+            "`petrobot estop --clear` lets the devices accept commands again; a device that "
+            "services.toml gives to a node of another host meanwhile starts free there"
+        )

@@ -59,8 +59,7 @@ def run(options: argparse.Namespace) -> int:
     if (log := _node_log(options)) is not None:
         why = "the log of a node is text; leave it out"
         refuse_idle(options, why, idle={"format", "mcap"})
-        with log.open(encoding="utf-8", errors="replace") as lines:
-            _write(options.out, (line.rstrip("\n") for line in lines))
+        _write(options.out, _node_lines(log))
         return 0
     found = recorded(options.run)
     why = "it is for the log of a node, and this is a run; leave it out"
@@ -111,6 +110,17 @@ def _node_log(options: argparse.Namespace) -> Path | None:
             f"on the node's own host ({host}); give its folder with --logs",
         )
     return path
+
+
+def _node_lines(log: Path) -> Iterator[str]:
+    from petrobot.coordinator.run.supervisor import older_part
+
+    for part in (older_part(log), log):
+        with (
+            contextlib.suppress(FileNotFoundError),
+            part.open(encoding="utf-8", errors="replace") as lines,
+        ):
+            yield from (line.rstrip("\n") for line in lines)
 
 
 def _write_mcap(path: Path, found: Recorded) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -102,9 +103,10 @@ def named_port(port: int) -> Iterator[None]:
     try:
         yield
     except OSError as fault:
-        raise CommandError(
-            2, f"port {port}: {fault.strerror or fault}; choose another with --page-port"
-        ) from fault
+        # The text of the fault repeats the address.
+        why = os.strerror(fault.errno) if fault.errno else str(fault)
+        text = f"port {port}: {why}; choose another with --page-port"
+        raise CommandError(2, text) from fault
 
 
 # Logging of the coordinator: one logger per package, to standard error.

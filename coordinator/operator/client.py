@@ -17,8 +17,9 @@ from petrobot.coordinator.page.sessions import LARGEST_SNAPSHOT
 
 LOST_AFTER = 3.0
 """Silence after which the connection counts as lost (s); the server sends `alive` every second."""
-ANSWER = 10.0
-"""Longest wait for the answer to a command (s)."""
+ANSWER, START_ANSWER = 10.0, 60.0
+"""Longest wait for the answer to a command (s). A start checks the task and connects to its nodes
+first, and a caller that no longer waited would not know that the run has begun."""
 
 
 class OperatorError(Exception):
@@ -96,17 +97,18 @@ class OperatorClient:
             raise OperatorError(self.over or "not connected")
         self._numbers += 1
         number = self._numbers
+        within = START_ANSWER if verb == "start" else ANSWER
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
         message = {"type": "command", "id": number, "verb": verb, "data": data or {}}
         try:
             with contextlib.suppress(ConnectionError):  # the reader ends `answer`, and says why
                 await self._socket.send_json(message)
-            async with asyncio.timeout(ANSWER):
+            async with asyncio.timeout(within):
                 await answer
             given: dict[str, Any] = answer.result()
             return given
         except TimeoutError:
-            raise OperatorError(f"no answer to {verb} within {ANSWER:g} s") from None
+            raise OperatorError(f"no answer to {verb} within {within:g} s") from None
         finally:
             self._answers.pop(number, None)
 

@@ -270,7 +270,9 @@ async def _latch(directory: Directory, node: str) -> str:
             "it is started again"
         )
     try:
-        path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
+        # By name, too: services.toml may give a device to another node before this one is cleared.
+        stopped = [ALL, *_devices_of(directory, node)]
+        path = await asyncio.to_thread(latch_of(directory.source, node).stop, stopped)
     except LatchError as fault:
         return f"not latched: {fault}; do not start {node} again before the cell is safe"
     return (
@@ -284,12 +286,16 @@ async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
     the stop is cleared."""
     if node not in await asyncio.to_thread(still_stopped, directory):
         return "", False
-    devices = [name for name, device in directory.devices.items() if device.node == node]
+    devices = _devices_of(directory, node)
     try:
         await asyncio.to_thread(latch_of(directory.source, node).clear, devices, devices)
     except LatchError as fault:
         return f"not cleared: {fault}", False
     return "its stop is cleared on disk, so its devices accept orders once it runs", True
+
+
+def _devices_of(directory: Directory, node: str) -> list[str]:
+    return [name for name, device in directory.devices.items() if device.node == node]
 
 
 def still_stopped(directory: Directory) -> list[str]:

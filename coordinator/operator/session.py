@@ -252,6 +252,13 @@ class RunSession(ABC):
         return {"learned": told}
 
 
+def import_for_runs() -> None:
+    """Import what draws and counts would import at the first use: the coordinator would not answer
+    its nodes in the middle of the run, nor, on a busy host, its page's clients at a start."""
+    for module in ("numpy", "scipy.special"):
+        importlib.import_module(module)
+
+
 class RealtimeSession(RunSession):
     """A run with the nodes of the cell in wall-clock time."""
 
@@ -273,10 +280,7 @@ class RealtimeSession(RunSession):
         """`begin` makes a resumed mission continue, `shown` is what operators see of its recorded
         steps; `ordered` as for `RunRequest`."""
         super().__init__(mission, selector, learning, folder, observers, resumed=begin is not None)
-        for module in ("numpy", "scipy.special"):
-            # What draws and counts imports it at the first use, and then the coordinator would
-            # not answer its nodes in the middle of the run.
-            importlib.import_module(module)
+        import_for_runs()
         self.shell = RealtimeMission(mission, directory, credentials_of(directory), ordered)
         self._begin, self._shown = begin or mission.start, shown
 

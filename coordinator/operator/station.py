@@ -24,7 +24,7 @@ from petrobot.coordinator.operator.port import Answer, Controls, Feed, refusal
 from petrobot.coordinator.operator.prepare import RunRequest, prepare, prepare_from
 from petrobot.coordinator.operator.run_address import RunAddress
 from petrobot.coordinator.operator.run_state import ChangePublisher
-from petrobot.coordinator.operator.session import LOCKSTEP, RunSession
+from petrobot.coordinator.operator.session import LOCKSTEP, RunSession, import_for_runs
 from petrobot.coordinator.operator.start_form import read_start, read_start_from
 from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.page.task_store import StoreError, TaskStore, TaskText
@@ -69,6 +69,7 @@ class Station:
         mock: Path | None = None,
         estimates: Path = Path("estimates"),
     ) -> None:
+        import_for_runs()
         self.directory = directory
         self.feed = Feed()
         self.controls = Controls(self.feed)

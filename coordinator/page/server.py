@@ -84,7 +84,8 @@ async def start_page(
     Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and saving one makes a
     copy there. `runs` has a folder for each recorded run. `port` 0 selects a free one. `token` is
     random unless given. Raises OSError if the port cannot be used."""
-    listener = _listen(port)
+    # It listens at once: until then, another process could still take the port.
+    listener = sockets.create_server((HOST, port), backlog=128)
     number = listener.getsockname()[1]
     access = AccessRules(token or secrets.token_hex(24), number)
     page_state = PageState(
@@ -104,18 +105,6 @@ async def start_page(
     )
     url = f"http://{HOST}:{number}/?token={access.token}"
     return Page(runner, listening, page_state, url)
-
-
-def _listen(port: int) -> sockets.socket:
-    listener = sockets.socket()
-    try:
-        listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
-        listener.bind((HOST, port))
-        listener.setblocking(False)
-    except OSError:
-        listener.close()
-        raise
-    return listener
 
 
 def _application(page_state: PageState, page: bool) -> web.Application:

@@ -9,13 +9,16 @@ import ctypes
 import functools
 import logging
 import os
+import shutil
 import signal
 import socket
+import stat
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import BinaryIO
 
 from petrobot.services.host.whole_file import make_folder
 
@@ -28,6 +31,8 @@ LONGEST_PAUSE = 8.0
 # talking
 LAST_WORDS = 0.5
 READY = b"ready"  # what a program prints when others may use it
+LARGEST_LOG = 32 << 20  # of a node (bytes), and as much again in the older part
+LOOK_AT_LOG = 1.0  # pause between looks at its size (s)
 STABLE_AFTER = 10.0  # after this uptime (s) a node starts again without a pause
 
 
@@ -179,7 +184,13 @@ class Supervisor:
         loop, pause = asyncio.get_running_loop(), FIRST_PAUSE
         while not self._stopping:
             started = loop.time()
-            await self._run_once(child)
+            try:
+                await self._run_once(child)
+            except OSError as fault:
+                if not child.ready.is_set():
+                    raise
+                # As when there is no room for another process: that may pass.
+                _log.warning("node %s could not be started: %s", child.program.name, fault)
             if self._stopping or not self._respawn or not child.ready.is_set():
                 return
             pause = (
@@ -187,13 +198,16 @@ class Supervisor:
                 if loop.time() - started > STABLE_AFTER
                 else min(2 * pause, LONGEST_PAUSE)
             )
-            _log.warning("node %s died; starting it again in %g s", child.program.name, pause)
+            name = child.program.name
+            _log.warning(
+                "node %s died; its log is %s; starting it again in %g s", name, child.log, pause
+            )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._over.wait()
 
     async def _run_once(self, child: _Child) -> None:
-        with child.log.open("ab", buffering=0) as log:
+        with _opened(child) as log:
             child.begun_at = log.seek(0, os.SEEK_END)
             async with output_pipe() as (end, output):
                 process = await asyncio.create_subprocess_exec(
@@ -211,12 +225,67 @@ class Supervisor:
                 if self._stopping:
                     _signal(child, signal.SIGTERM)
                 copying = asyncio.create_task(_copy(child, output, log))
+                limiting = asyncio.create_task(_limit(child, log))
                 await process.wait()
                 await asyncio.wait({copying}, timeout=LAST_WORDS)
                 copying.cancel()
+                limiting.cancel()
                 fault = child.log_fault
                 if fault is not None and not child.ready.is_set():
                     raise fault
+
+
+def _opened(child: _Child) -> FileIO:
+    """Open the log of a node. Once the node was ready, it runs without one rather than not at
+    all."""
+    try:
+        make_folder(child.log.parent)
+        return FileIO(child.log, "a+")
+    except OSError as fault:
+        if not child.ready.is_set():
+            raise
+        why = fault.strerror or fault
+        _log.warning(
+            "%s: %s; node %s has no log until it starts again", child.log, why, child.program.name
+        )
+        return FileIO(os.devnull, "a+")
+
+
+async def _limit(child: _Child, log: FileIO) -> None:
+    """Look at the size of a log, and move what is in it to the older part when it is too long."""
+    while True:
+        await asyncio.sleep(LOOK_AT_LOG)
+        status = os.fstat(log.fileno())
+        if not stat.S_ISREG(status.st_mode) or status.st_size <= LARGEST_LOG:
+            continue
+        try:
+            # Opened again: its writers move the position that they share with `log`. And by its
+            # number: a log that was removed must not grow for ever either.
+            file = FileIO(f"/proc/self/fd/{log.fileno()}", "r+")
+            await asyncio.to_thread(_move, file, older_part(child.log))
+            child.begun_at = 0
+        except OSError as fault:
+            _log.warning("%s: the log is too long and cannot be cut: %s", child.log, fault)
+
+
+def _move(log: FileIO, older: Path) -> None:
+    """Move what is in a log to another file. The log's processes keep it open, so it is copied and
+    emptied, not renamed. If the copy finds no room, what was in the log is lost."""
+    with log:
+        try:
+            older.unlink(missing_ok=True)  # first, as that makes room
+            with older.open("xb") as copy:
+                shutil.copyfileobj(log, copy)
+        except OSError as fault:
+            _log.warning("%s: %s; older lines of the log are lost", older, fault.strerror or fault)
+            with contextlib.suppress(OSError):
+                older.unlink(missing_ok=True)
+        log.truncate(0)
+
+
+def older_part(log: Path) -> Path:
+    """Return the file with what a node wrote before its log was last emptied."""
+    return log.with_name(f"{log.name}.1")
 
 
 @asynccontextmanager
@@ -240,7 +309,7 @@ async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asy
             transport.close()
 
 
-async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
+async def _copy(child: _Child, output: asyncio.StreamReader, log: FileIO) -> None:
     """Write what a program prints to its log, and note when it is ready. If the log cannot be
     written before that, the program is ended; later the program matters more than its log."""
     said, told = b"", False

@@ -72,6 +72,19 @@ class Latch:
         LatchError."""
         return self._write(".stopped", sorted(self.stopped() | set(devices)))
 
+    def moved_here(self, devices: Iterable[str]) -> set[str]:
+        """Return which of these devices another node on this host has stopped: services.toml gave
+        them to this node while they were stopped."""
+        return set(devices) & set().union(*map(_read, self._of_others()))
+
+    def _of_others(self) -> list[Path]:
+        return [
+            other
+            for path in self.paths
+            for other in path.parent.glob("*.stopped")
+            if other.name != path.name
+        ]
+
     @property
     def cleared(self) -> Cleared:
         """The stops that were cleared. Files that cannot be read do not count."""
@@ -105,10 +118,12 @@ class Latch:
             self._write(".cleared", [str(number), str(uptime()), *by_device])
         if left:
             self.stop(left)
-        for path in self.paths:
+        moved = {path: _read(path) for path in self._of_others()}
+        kept = {path: names - set(devices) for path, names in moved.items() if names & set(devices)}
+        for path, names in {**dict.fromkeys(self.paths, left), **kept}.items():
             try:
-                if left and path.exists():
-                    _write(path, sorted(left))
+                if names and path.exists():
+                    _write(path, sorted(names))
                 else:
                     path.unlink(missing_ok=True)
             except OSError as fault:
@@ -136,6 +151,7 @@ def latch_of(source: Path, node: str) -> Latch:
 
 def _read(path: Path) -> frozenset[str]:
     try:
+        path.stat()  # needs no file descriptor: without a free one, a missing file is still missing
         names = path.read_text(encoding="utf-8").split()
     except FileNotFoundError:
         return frozenset()

@@ -43,6 +43,8 @@ class ForkServer:
     It has the working directory, environment and output of its start, so another one takes its
     place when one of these has changed, and also when it has ended or does not read."""
 
+    kept_open: ClassVar[tuple[int, ...]] = ()
+    """Descriptors that it and all that it forks keep open until they end."""
     _current: ClassVar[ForkServer | None] = None
     _former: ClassVar[list[ForkServer]] = []
     """Those that take no more orders and have perhaps not ended."""
@@ -58,9 +60,9 @@ class ForkServer:
                     sys.executable,
                     "-m",
                     "petrobot.services.worker.keeper",
-                    *map(str, (os.getpid(), there.fileno())),
+                    *map(str, (os.getpid(), there.fileno(), *self.kept_open)),
                 ],
-                pass_fds=[there.fileno()],
+                pass_fds=[there.fileno(), *self.kept_open],
                 stdin=subprocess.DEVNULL,
                 # a Ctrl-C in the node's terminal is for the node: it ends its children in order
                 start_new_session=True,

@@ -101,6 +101,9 @@ class EmergencyStops:
         """Return the devices that start in emergency stop: those of the latch, or all of them if
         the latch cannot be kept, because then one may have been lost."""
         unsure = self._latch is not None and not self._latch.kept
+        if self._latch is not None and (moved := self._latch.moved_here(self._devices)):
+            self.stop(moved)
+            return sorted(self._stopped.union(self.look(0.0)[0]))
         return self._add(self._devices) if unsure else self.look(0.0)[0]
 
     def look(self, now: float) -> tuple[list[str], list[str]]:

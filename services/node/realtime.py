@@ -19,13 +19,13 @@ from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.link import Alarm, clock_of
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import Directory, DirectoryError, sources
-from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
+from petrobot.services.comm.location_file.host_checks import claim, listening
 from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.comm.protocol.security import all_keys, require_key
 from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
-from petrobot.services.node.child import LEAVE_LIMIT
+from petrobot.services.node.child import LEAVE_LIMIT, ForkServer
 from petrobot.services.node.emergency_stops import BEAT_EVERY
 from petrobot.services.node.inline_host import Host
 from petrobot.services.node.node import GENERAL, LOOP, Node, stream_service
@@ -115,7 +115,6 @@ class NodeShell:
         the address cannot be used, and KeyNeededError."""
         host, port = self._directory.address(self._name)
         require_key(self._name, host, self._credentials.guarded)
-        refuse_unusable(self._directory, self._name)
         try:
             for place in self._workers.values():
                 place.start()
@@ -284,6 +283,10 @@ async def serve(directory: Directory, name: str, text: str, *, mock: str, memory
     loop = asyncio.get_running_loop()
     if wanted_with_parent():
         _end_with_launcher(os.getppid(), over)
+    # Its children keep it open, too: while the driver's process of a killed node stops its device,
+    # the node's successor must not make a second driver.
+    claimed = claim(directory, name)
+    ForkServer.kept_open = (claimed.fileno(),)
     shell = NodeShell(directory, name, text, mock=mock, memory=memory)
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, over.set)

@@ -189,8 +189,11 @@ def keep_worker(
 
 
 def main(arguments: list[str]) -> None:
-    """Entry point of the fork server: `NODE ORDERS`, a process id and an inherited socket."""
-    node, orders = map(int, arguments)
+    """Entry point of the fork server: `NODE ORDERS [KEPT_OPEN ...]`, a process id and inherited
+    descriptors."""
+    node, orders, *kept_open = map(int, arguments)
+    for descriptor in kept_open:
+        os.set_inheritable(descriptor, False)  # not by programs that user code leaves running
     die_with(node)
     for ignored in _IGNORED:
         signal.signal(ignored, signal.SIG_IGN)

@@ -145,6 +145,9 @@ def test_the_log_of_a_node_is_printed_by_its_name(
     (tmp_path / "logs" / "robot.log").write_text("12:00 INFO run r1 started\nits last word")
     assert main(command) == 0
     assert capsys.readouterr().out == "12:00 INFO run r1 started\nits last word\n"
+    (tmp_path / "logs" / "robot.log.1").write_text("11:00 older\n")
+    assert main(command) == 0
+    assert capsys.readouterr().out.startswith("11:00 older\n12:00 INFO")
     assert main(["log", "robots", "--services", services]) == 2
     assert "no run 'robots'" in capsys.readouterr().err
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from petrobot.services.__main__ import main
-from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.comm.location_file import Directory, DirectoryError, host_checks, parse
 from petrobot.services.comm.location_file.host_checks import (
     cannot_listen,
+    claim,
     listening,
-    refuse_unusable,
 )
 from petrobot.services.comm.lockstep.cell import CellError
 from petrobot.services.comm.lockstep.mesh import Member
@@ -94,7 +94,7 @@ def test_an_address_of_another_host_is_an_error_of_host(tmp_path: Path) -> None:
         DirectoryError,
         match=r"services\.toml: nodes\.left\.host: 192\.0\.2\.1 is not an address of this host",
     ):
-        refuse_unusable(directory, "left")
+        claim(directory, "left")
     with (
         pytest.raises(DirectoryError, match=r"nodes\.left\.port: 7301 is in use"),
         listening(directory, "left"),
@@ -102,10 +102,17 @@ def test_an_address_of_another_host_is_an_error_of_host(tmp_path: Path) -> None:
         raise OSError(errno.EADDRINUSE, "in use")
 
 
-def test_a_free_address_is_accepted(tmp_path: Path) -> None:
-    """It is free again afterwards."""
+def test_a_free_address_is_accepted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server may listen there, and no other process can claim it until this one gives it up."""
     [port] = free_ports(1)
-    refuse_unusable(directory_in(tmp_path, "127.0.0.1", port), "left")
+    directory = directory_in(tmp_path, "127.0.0.1", port)
+    monkeypatch.setattr(host_checks, "CLAIM_LIMIT", 0.1)
+    with (
+        claim(directory, "left"),
+        pytest.raises(DirectoryError, match=rf"nodes\.left\.port: {port} is in use"),
+    ):
+        claim(directory, "left")
+    claim(directory, "left").close()
     with socket.create_server(("127.0.0.1", port)) as again:
         assert again.getsockname()[1] == port
 

@@ -610,3 +610,100 @@ def _cpu(nodes: Nodes) -> float:
             fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
             total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     return total
+
+
+SLOW_TO_START = """
+import time
+from pathlib import Path
+from petrobot import Driver
+
+class Slow(Driver):
+    period = 0.01
+
+    def __init__(self, config, ports):
+        super().__init__(config, ports)
+        with Path(__file__).with_name("made").open("a") as made:
+            made.write("made\\n")
+        time.sleep(0.5)
+
+    def step(self, now):
+        pass
+
+    def stopped(self):
+        return True
+"""
+
+
+@pytest.mark.processes
+def test_of_two_processes_of_a_node_started_together_one_touches_its_device(
+    tmp_path: Path,
+) -> None:
+    """As two people do who both run `petrobot up`. The first listens only once its device is ready;
+    the second must not disturb it before that either."""
+    (tmp_path / "slow.py").write_text(SLOW_TO_START)
+    file = tmp_path / "services.toml"
+    file.write_text(
+        f'schema = 1\nnodes.left = {{ host = "127.0.0.1", port = {free_ports(1)[0]} }}\n'
+        'devices.slow = { node = "left", driver = "slow:Slow" }\n'
+    )
+    nodes = [start_node("left", file) for _ in range(2)]
+    try:
+        said = sorted("ready" in node.stdout.readline() for node in nodes if node.stdout)
+        assert said == [False, True]
+        assert (tmp_path / "made").read_text() == "made\n"
+        assert "is in use on 127.0.0.1" in (tmp_path / "left.log").read_text()
+    finally:
+        for node in nodes:
+            node.terminate()
+            node.communicate(timeout=PATIENCE)
+
+
+SLOW_TO_STOP = """
+import os, time
+from pathlib import Path
+from petrobot import Driver
+
+class Slow(Driver):
+    period = 0.01
+    asked = None
+
+    def note(self, what):
+        with Path(__file__).with_name("notes").open("a") as notes:
+            notes.write(f"{what} {os.getpid()}\\n")
+
+    def __init__(self, config, ports):
+        super().__init__(config, ports)
+        self.note("made")
+
+    def step(self, now):
+        self.note("step")
+
+    def stop(self, now):
+        self.asked = self.asked or time.monotonic()
+
+    def stopped(self):
+        return self.asked is not None and time.monotonic() > self.asked + 30
+"""
+
+
+@pytest.mark.processes
+def test_the_successor_of_a_killed_node_waits_until_the_driver_has_ended(tmp_path: Path) -> None:
+    """A killed node's driver has up to 3 s for the stop routine of its device."""
+    (tmp_path / "slow.py").write_text(SLOW_TO_STOP)
+    file = tmp_path / "services.toml"
+    file.write_text(
+        f'schema = 1\nnodes.left = {{ host = "127.0.0.1", port = {free_ports(1)[0]} }}\n'
+        'devices.slow = { node = "left", driver = "slow:Slow" }\n'
+    )
+    for _ in range(2):
+        node = start_node("left", file)
+        try:
+            assert node.stdout is not None and "ready" in node.stdout.readline()
+            node.stdout.close()  # not `communicate`: the driver keeps it open, too
+        finally:
+            node.kill()
+            node.wait(timeout=PATIENCE)
+    drivers = [line.split()[1] for line in (tmp_path / "notes").read_text().splitlines()]
+    first = drivers[0]
+    assert len(set(drivers)) == 2
+    assert first not in drivers[drivers.index(drivers[-1]) :], "two drivers moved one device"

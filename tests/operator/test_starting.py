@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
+import sys
 from collections.abc import AsyncIterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -494,3 +496,31 @@ async def test_a_damaged_journal_is_reported(cell: Simulated) -> None:
     (cell.runs / run / JOURNAL).write_bytes(raw)
     answer = await cell.say("start", **{"from": {"run": run, "record": 1}})
     assert not answer["ok"] and "damaged" in answer["text"]
+
+
+IMPORTS = """\
+import asyncio, sys
+from pathlib import Path
+from petrobot.coordinator.operator.station import Station
+from petrobot.coordinator.page.task_store import TaskStore
+from petrobot.services.comm.location_file import load
+
+async def main(folder):
+    station = Station(load(folder / "services.toml"), TaskStore(folder, None), folder)
+    print("scipy.special" in sys.modules)
+    await station.close()
+
+asyncio.run(main(Path(sys.argv[1])))
+"""
+
+
+@pytest.mark.processes
+def test_what_a_run_imports_is_there_before_the_first_client(tmp_path: Path) -> None:
+    """Else the page is silent at the first start: on a busy host for longer than its clients
+    wait."""
+    (tmp_path / "services.toml").write_text(
+        'schema = 1\nnodes.left = { host = "127.0.0.1", port = 7301 }\n'
+    )
+    command = [sys.executable, "-c", IMPORTS, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "True\n"

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.run.supervisor import LaunchError, Program, Supervisor
+from petrobot.coordinator.run import supervisor
+from petrobot.coordinator.run.supervisor import LaunchError, Program, Supervisor, older_part
 from tests.processes import alive, kill
 from tests.waiting import beat, until
 
@@ -19,6 +20,13 @@ pytestmark = pytest.mark.processes
 STEADY = "print('ready', flush=True); import signal; signal.pause()"
 BRIEF = "print('ready', flush=True)"
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + STEADY
+TALKING = """
+import os, sys, time
+print("ready", flush=True)
+for i in range(10**9):
+    os.write(1 + i % 2, b"line %d\\n" % i)
+    time.sleep(0.001)
+"""
 FAULTY = "import sys; print('no device at can0', file=sys.stderr); sys.exit(2)"
 
 
@@ -151,3 +159,81 @@ async def test_a_long_line_does_not_end_the_copying_of_what_a_program_prints(
     said = "print('x' * (1 << 20), flush=True); " * 2
     async with Supervisor([program("a", f"{said}{STEADY}")], tmp_path):  # until it is ready
         assert (tmp_path / "a.log").stat().st_size > 2 << 20
+
+
+@pytest.fixture
+def short_logs(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Logs are cut at 2 kB, within a few lines; returns that limit (bytes)."""
+    monkeypatch.setattr(supervisor, "LARGEST_LOG", 2000)
+    monkeypatch.setattr(supervisor, "LOOK_AT_LOG", 0.01)
+    return 2000
+
+
+async def test_the_log_of_a_program_that_runs_for_long_has_a_limit(
+    tmp_path: Path, short_logs: int
+) -> None:
+    log = tmp_path / "a.log"
+    async with Supervisor([program("a", TALKING)], tmp_path) as keeper:
+        for _ in range(3):
+            await until(lambda: log.stat().st_size > short_logs // 2, "a long log")
+            await until(lambda: log.stat().st_size < short_logs // 2, "a log that was emptied")
+        older = older_part(log).read_text()
+        await until(lambda: log.stat().st_size > 100, "further lines")
+        assert keeper.starts("a") == 1
+    assert older.count("line ") > 0 and "\0" not in older + log.read_text()
+    assert sorted(tmp_path.iterdir()) == [log, older_part(log)]
+
+
+async def test_a_log_without_room_for_its_older_part_loses_lines_and_ends_nothing(
+    tmp_path: Path, short_logs: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = tmp_path / "a.log"
+    older_part(log).mkdir()  # as if the disk was full: it cannot be written
+    async with Supervisor([program("a", TALKING)], tmp_path) as keeper:
+        await until(lambda: "older lines of the log are lost" in caplog.text, "the warning")
+        await until(lambda: log.stat().st_size < short_logs, "a log that was emptied")
+        assert keeper.starts("a") == 1
+
+
+async def test_a_log_that_was_removed_does_not_grow_for_ever(
+    tmp_path: Path, short_logs: int
+) -> None:
+    log = tmp_path / "a.log"
+    async with Supervisor([program("a", TALKING)], tmp_path):
+        await until(log.exists, "the log")
+        with log.open("rb") as removed:
+            log.unlink()
+            for _ in range(3):
+                await until(lambda: os.fstat(removed.fileno()).st_size > 1000, "a long log")
+                await until(lambda: os.fstat(removed.fileno()).st_size < 1000, "an emptied one")
+
+
+@pytest.mark.parametrize("barred", [False, True])
+async def test_a_program_is_restarted_although_the_folder_of_its_log_is_gone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, barred: bool
+) -> None:
+    logs = tmp_path / "logs"
+    async with Supervisor([program("a", STEADY)], logs) as keeper:
+        (logs / "a.log").unlink()
+        logs.rmdir()
+        if barred:
+            logs.touch()
+        os.kill(keeper.process_ids()["a"], signal.SIGKILL)
+        await until(lambda: "node a is ready again" in caplog.messages, "another start")
+    assert ("has no log until it starts again" in caplog.text) == barred == (not logs.is_dir())
+
+
+async def test_a_program_that_cannot_be_started_for_a_while_is_tried_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So it is when the host has no room for another process."""
+
+    async def refuse(*_: object, **__: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    async with Supervisor([program("a", STEADY)], tmp_path) as keeper:
+        monkeypatch.setattr(asyncio, "create_subprocess_exec", refuse)
+        os.kill(keeper.process_ids()["a"], signal.SIGKILL)
+        await until(lambda: "node a could not be started" in caplog.text, "a failed start")
+        monkeypatch.undo()
+        await until(lambda: "node a is ready again" in caplog.messages, "another start")

@@ -55,6 +55,21 @@ def test_a_damaged_latch_stops_everything(tmp_path: Path, content: bytes | None)
     assert stops.at_start() == list(DEVICES)
 
 
+def test_a_process_without_free_descriptors_stops_nothing_without_a_latch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As under a flood of connections: that is no emergency stop."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr("io.open", refuse)
+    assert latch(tmp_path).stopped() == frozenset()
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "motion.stopped").touch()
+    assert latch(tmp_path).stopped() == {ALL}, "in doubt it is stopped"
+
+
 def test_the_second_folder_is_used_if_the_first_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "first").mkdir()
     (tmp_path / "first" / "motion.stopped").mkdir()  # nothing can replace it
@@ -225,3 +240,21 @@ def test_a_device_that_is_renamed_while_it_is_stopped_stays_stopped(tmp_path: Pa
     assert latch(tmp_path).stopped() == {"puma"}, "known by its new name from now on"
     assert renamed.clear(["puma"]) == "" and latch(tmp_path).stopped() == frozenset()
     assert EmergencyStops(["puma", "eye"], latch(tmp_path)).at_start() == []
+
+
+@pytest.mark.parametrize("by", ["node", "command"])
+def test_a_device_that_is_moved_to_another_node_while_it_is_stopped_stays_stopped(
+    tmp_path: Path, by: str
+) -> None:
+    """On the same host. The command writes the file for a node that does not answer."""
+    left, right = (Latch(node, [tmp_path / "first", tmp_path / "second"]) for node in ("l", "r"))
+    if by == "node":
+        EmergencyStops(["arm", "eye"], left).stop(["arm", "eye"])
+    else:
+        left.stop([ALL, "arm", "eye"])
+    moved = EmergencyStops(["arm", "grip"], right)
+    assert moved.at_start() == ["arm"] and right.stopped() == {"arm"}
+    assert EmergencyStops(["lamp"], Latch("lamps", [tmp_path / "first"])).at_start() == []
+    assert moved.clear(["arm"]) == "" and moved.names == ()
+    assert "arm" not in left.stopped() and "eye" in left.stopped()
+    assert EmergencyStops(["arm", "grip"], right).at_start() == []

@@ -32,8 +32,9 @@ from petrobot.services.adapters.ros2.messages import Message
 _log = logging.getLogger(__name__)
 LOOK = 0.2
 """Least time between two messages of feedback (s)."""
-RESULT = 2.0
-"""Longest wait for the begin of a run, and after its end for its result (s)."""
+RESULT = 30.0
+"""Longest wait for the begin of a run, and after its end for its result (s): on a busy host either
+may take seconds, and a goal must not end while its run moves."""
 SUCCEEDED, CANCELLED, ABORTED = 4, 5, 6
 """action_msgs/msg/GoalStatus."""
 ENDS = ("success", "failure", "error", "aborted", "stopped")
@@ -104,10 +105,14 @@ class OfferedTask:
         """Start a run, follow it to its end, and report to ROS 2."""
         state = "refused"
         try:
+            start = self._wanted(args)
             async with self._connect() as page:
-                run = await self._start(page, args)
-                state = "unknown"  # from here on it moves, whatever happens to this connection
-                ended = await self._follow(goal, page, run)
+                state = "unknown"  # from here on it may move, whatever happens to this connection
+                answer = await _ordered(page, "start", start)
+                if not answer.get("ok"):
+                    state = "refused"
+                    raise ValueError(str(answer.get("text")))
+                ended = await self._follow(goal, page, str(answer["run"]))
         except (OperatorError, ValueError) as fault:
             ended = ABORTED, state, str(fault), ""
         except Exception as fault:  # answer at once, so that the client does not wait for ever
@@ -116,8 +121,8 @@ class OfferedTask:
         self._goal = ""
         self._result(goal, *ended)
 
-    async def _start(self, page: OperatorClient, args: Any) -> str:
-        """Start the run of a goal; return its id."""
+    def _wanted(self, args: Any) -> Message:
+        """Return the start that a goal wants. Raises ValueError."""
         if not isinstance(args, dict):
             raise ValueError(f"expected a goal with fields, found {args!r:.60}")
         parameters = {k: v for k, v in args.items() if k not in ("parameters", "runs", "seed")}
@@ -130,11 +135,7 @@ class OfferedTask:
             raise ValueError(f"parameters: expected the text of a JSON object, found {text!r:.60}")
         start = {"task": self._options.task, "mode": self._options.mode}
         start |= {"parameters": {**parameters, **given}}
-        start |= {name: args[name] for name in ("runs", "seed") if args.get(name)}
-        answer = await _ordered(page, "start", start)
-        if not answer.get("ok"):
-            raise ValueError(str(answer.get("text")))
-        return str(answer["run"])
+        return start | {name: args[name] for name in ("runs", "seed") if args.get(name)}
 
     async def _follow(self, goal: str, page: OperatorClient, run: str) -> tuple[int, str, str, str]:
         """Send the feedback of a run until it ends, and abort it if it must not continue. Return
@@ -144,7 +145,7 @@ class OfferedTask:
             return state["mission"]["id"] == run and state["mission"]["state"] not in ENDS
 
         told: Message = {}
-        await page.until(is_active, RESULT)
+        await page.until(lambda state: state["mission"]["id"] == run, RESULT)
         while is_active(page.state):
             marking, runs = page.state["marking"], page.state["runs"]
             feedback = {

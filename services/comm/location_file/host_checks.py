@@ -12,6 +12,7 @@ import ast
 import errno
 import importlib.util
 import socket
+import time
 from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
@@ -253,18 +254,38 @@ def listening(directory: Directory, node: str) -> Iterator[None]:
         raise DirectoryError((f"{directory.source}: {text}",)) from fault
 
 
-def refuse_unusable(directory: Directory, node: str) -> None:
+CLAIM_LIMIT = 15.0
+"""How long a node waits for another process of its address that does not listen (s): longer than
+that may take to end (GOOD_ORDER and STOP_ROUTINE in `parent_death.py`)."""
+
+
+def claim(directory: Directory, node: str) -> socket.socket:
     """Check that the address can be used, before devices are touched. Raises DirectoryError.
 
-    A second process of a node must not disturb the devices of the first.
+    A second process of a node must not disturb the devices of the first, which listens only while
+    they are ready. So as long as the returned socket is open, the address is this process's: the
+    kernel gives its name, which is no file, to one socket. It must stay open until the devices'
+    processes have ended.
     """
     host, port = directory.address(node)
+    until = time.monotonic() + CLAIM_LIMIT
     with listening(directory, node):
         family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[
             0
         ]
-        with socket.socket(family, kind, number) as probe:
-            # The same option as the listener has: connections that have ended do not block the
-            # port.
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
+        while True:
+            with socket.socket(family, kind, number) as probe:
+                # The same option as the listener has: connections that have ended do not block the
+                # port.
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+            claimed = socket.socket(socket.AF_UNIX)
+            try:
+                claimed.bind(f"\0petrobot {address[0]!s} {port}")
+            except OSError:
+                claimed.close()
+                if time.monotonic() > until:
+                    raise
+            else:
+                return claimed
+            time.sleep(0.05)  # the other one is starting, and will listen, or it is closing

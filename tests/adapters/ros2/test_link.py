@@ -29,11 +29,14 @@ class Stepped(Bridge):
     """A driver that the test steps, on the clock of the process."""
 
     def until(self, condition: Callable[[], object], awaited: str) -> None:
-        limit = Limit(f"{awaited}: {self.state()}")
-        while not condition() and limit.left():
-            self.ports.now = time.monotonic()  # type: ignore[misc]
-            self.step(time.monotonic())
-            time.sleep(0.005)
+        limit = Limit(awaited)
+        try:
+            while not condition() and limit.left():
+                self.ports.now = time.monotonic()  # type: ignore[misc]
+                self.step(time.monotonic())
+                time.sleep(0.005)
+        except AssertionError as fault:
+            raise AssertionError(f"{fault}: {self.state()}") from None
 
     def goal(self, name: str, run: str = "run") -> None:
         request = {"op": "send_action_goal", "action": name, "action_type": "a/action/B"}

@@ -35,6 +35,7 @@ class Page:
         self.phase, self.run, self.marking = "idle", "", {"a": 1}
         self.commands: list[tuple[str, dict[str, Any]]] = []
         self.gone, self.held, self.obeys = False, False, True
+        self.mute, self.late = False, 0.0
 
     async def __aenter__(self) -> Self:
         if self.gone:
@@ -67,10 +68,17 @@ class Page:
         if verb == "start" and self.held:
             return {"ok": False, "code": "not_holder", "text": "ana holds the controls"}
         if verb == "start":
-            self.run, self.phase = f"run-{len(self.commands)}", "running"
+            run = f"run-{len(self.commands)}"
+            asyncio.get_running_loop().call_later(self.late, self.begin, run)
+            if self.mute:
+                raise OperatorError("no answer to start within 60 s")
+            return {"ok": True, "run": run}
         if verb == "abort" and self.obeys:
             self.phase = "aborted"
         return {"ok": True, "run": self.run}
+
+    def begin(self, run: str) -> None:
+        self.run, self.phase = run, "running"
 
 
 class Link:
@@ -218,6 +226,30 @@ def test_a_goal_that_cannot_be_started_is_aborted_with_the_reason(
     assert link.results()[0] == ("g1", 6, "refused")
     (reason, *_) = [m["values"]["reason"] for m in link.sent if m["op"] == "action_result"]
     assert word in reason
+
+
+def test_a_start_without_an_answer_is_not_reported_as_refused() -> None:
+    """A busy coordinator may have begun the run."""
+
+    async def steps(page: Page, link: Link) -> None:
+        page.mute = True
+        link.say("send_action_goal", "g1", args={})
+        await until(link.results, "the result")
+
+    page, link = played(steps)
+    assert link.results() == [("g1", 6, "unknown")] and page.phase == "running"
+
+
+def test_a_goal_lasts_until_its_run_ends_although_that_begins_late() -> None:
+    async def steps(page: Page, link: Link) -> None:
+        page.late = 3.0
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: link.results() or page.phase == "running", "the run")
+        assert not link.results()
+        page.phase = "success"
+        await until(link.results, "the result")
+
+    assert played(steps)[1].results() == [("g1", 4, "success")]
 
 
 def test_one_goal_at_a_time() -> None:
