@@ -5,6 +5,8 @@ import { drawn } from "./drawn.js";
 import { around, group, groups, members, own, ungroup, within } from "./macros.js";
 
 const UNDO_KEPT = 300;
+/** What to do about a transition that only the table `errors` makes. */
+export const MADE = "This error branch is made by the table errors of the file. To draw another one, choose its place and press Add error branch.";
 const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
 
 export const emptyDocument = (name) => ({ schema: 1, task: { name, final: "false" }, primitive_tasks: {}, events: {}, places: {}, transitions: {} });
@@ -170,6 +172,7 @@ export class Model {
     if (groups(a ?? b)) return "An arc ends at a place inside the macro place. Put a place into it first.";
     const place = a ? from : to;
     const transition = this.transition(a ? to : from);
+    if (!transition) return MADE;
     const same = listed(a ? transition.in : transition.out).map(readArc).find((arc) => arc?.place === place && arc.inhibit === inhibit);
     if (same) {
       this.setArc({ direction: inhibit ? "inhibit" : a ? "in" : "out", place, transition: a ? to : from }, { weight: same.weight + 1 });

@@ -2,6 +2,7 @@
 
 import { attribute, s } from "../dom.js";
 import { border, snap } from "../geometry.js";
+import { isMovable } from "./arrange.js";
 
 const NEAR = 7;
 const MOVED = 4;
@@ -117,7 +118,7 @@ export class Pointer {
     if (!designer.selection.names.has(element.name)) designer.choose(new Set([element.name]));
     view.focusable(element.name);
     const [x0, y0] = view.at(event.clientX, event.clientY);
-    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter((e) => e && !e.outside).map((e) => [e.name, { x: e.x, y: e.y }]));
+    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter((e) => e && isMovable(e)).map((e) => [e.name, { x: e.x, y: e.y }]));
     if (!moved.has(element.name)) return designer.choose(new Set([element.name]));
     const others = [...view.elements.values()].filter((e) => !moved.has(e.name) && !view.isFolded(e));
     let going = false;
