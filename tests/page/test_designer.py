@@ -539,7 +539,7 @@ to = "given_up"
 async def test_error_branches_of_the_table_errors_are_drawn(
     browser: Browser, page: Page, tasks: Path
 ) -> None:
-    """What `[errors]` makes is drawn and folded as any error branch, on a spot near its neighbours.
+    """What `[errors]` makes is drawn and folded as any error branch, near its neighbours.
     It is chosen and explained, but not moved or deleted, until another branch is drawn there."""
     path = tasks / "gives_up.toml"
     text = (tasks / "pick_and_place.toml").read_text()

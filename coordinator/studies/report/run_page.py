@@ -40,7 +40,7 @@ ROW, LEFT, WIDTH = 26, 150, 1040
 SECOND = 10.0
 """Least number of pixels per second; a long Gantt chart becomes wider than the page."""
 LETTER = 13.0
-"""Width of the narrowest bar that gets a letter: a letter with its halo, in pixels. On a shorter one
+"""Width of the narrowest bar that gets a letter: a letter with its halo (pixels). On a shorter bar
 it would cover the bars beside it."""
 LONGEST = 600.0
 """Seconds shown in a Gantt chart; the table of firings lists the rest."""
