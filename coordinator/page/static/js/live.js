@@ -3,7 +3,7 @@
 import { Cameras, Devices } from "./camera.js";
 import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
-import { attribute, fill, h, Press, rows, seconds, text, words } from "./dom.js";
+import { attribute, fill, h, Press, rows, seconds, text, valueText, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
@@ -372,7 +372,7 @@ class Dock {
   paintTable(host, values, empty) {
     const list = Object.entries(values);
     if (!list.length) return fill(host, h("p", { class: "empty" }, empty));
-    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, typeof value === "string" ? value : value === null ? "–" : JSON.stringify(value)))))));
+    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, valueText(value)))))));
   }
 
   paintEvents(state) {
