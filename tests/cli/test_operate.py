@@ -285,8 +285,10 @@ async def test_watch_shows_variables(
         return f"{line}\n" in "".join(printed)
 
     await until(lambda: shows("variables: bin = null"))
+    petrobot.operation.feed.emit("variable", time=1.0, name="look.status", value="success")
     petrobot.operation.feed.emit("variable", time=1.0, name="bin", value="left")
     await until(lambda: shows('variable bin = "left"'))
+    assert "look.status" not in "".join(printed)
     await petrobot("abort")
     await watching
 

@@ -14,15 +14,13 @@ const ended = (state, { place, end }) =>
 
 const NAMES = /"[^"]*"|'[^']*'|[\p{L}_][\p{L}\p{N}_.]*/gu;
 
-/** The present values of the variables and places that a text of the element `name` reads, by their names; in a subnet, those inside it come first. */
+/** The present values of the variables that a text of the element `name` reads, by their names; in a subnet, those inside it come first. */
 function valuesIn(state, text, name) {
   const inside = name.slice(0, name.lastIndexOf(".") + 1);
   const found = new Map();
   for (const [word] of String(text).matchAll(NAMES)) {
-    for (const table of [state.variables, state.marking]) {
-      const key = [inside + word, word].find((one) => Object.hasOwn(table, one));
-      if (key && !found.has(word)) found.set(word, valueText(table[key]));
-    }
+    const key = [inside + word, word].find((one) => Object.hasOwn(state.variables, one));
+    if (key) found.set(word, valueText(state.variables[key]));
   }
   return found;
 }

@@ -30,6 +30,7 @@ export class Verdicts {
     this.heatButton.hidden = true;
     attribute(this.heatButton, "aria-pressed", "false");
     this.head.textContent = "";
+    attribute(this.root, "data-state", null);
     fill(this.list);
   }
 
