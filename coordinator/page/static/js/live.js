@@ -300,7 +300,7 @@ export function reasonText(firing) {
 function valuesShown({ variables }) {
   const runs = new Map();
   for (const [name, value] of Object.entries(variables)) {
-    const place = name.slice(0, name.lastIndexOf("."));
+    const place = name.includes(".") ? name.slice(0, name.lastIndexOf(".")) : "";
     if (place && value !== "") runs.set(place, [...(runs.get(place) ?? []), `${name.slice(place.length + 1)} ${valueText(value)}`]);
   }
   const own = Object.entries(variables).filter(([name]) => !name.includes("."));
