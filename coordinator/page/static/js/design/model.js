@@ -165,6 +165,7 @@ export class Model {
   /** Draw an arc; returns null, or why it cannot be drawn. */
   connect(from, to, inhibit = false) {
     const [a, b] = [this.place(from), this.place(to)];
+    if (![from, to].every((name) => this.has(name))) return MADE;
     if (from === to) return "An arc connects two different elements.";
     if (a && b) return "An arc connects a place and a transition, never two places. Put a transition between them.";
     if (!a && !b) return "An arc connects a place and a transition, never two transitions. Put a place between them.";
@@ -172,7 +173,6 @@ export class Model {
     if (groups(a ?? b)) return "An arc ends at a place inside the macro place. Put a place into it first.";
     const place = a ? from : to;
     const transition = this.transition(a ? to : from);
-    if (!transition) return MADE;
     const same = listed(a ? transition.in : transition.out).map(readArc).find((arc) => arc?.place === place && arc.inhibit === inhibit);
     if (same) {
       this.setArc({ direction: inhibit ? "inhibit" : a ? "in" : "out", place, transition: a ? to : from }, { weight: same.weight + 1 });

@@ -100,14 +100,14 @@ export class Pointer {
     const { designer, view } = this;
     const kept = designer.tools.tool;
     let to = name;
-    if (!to) {
+    if (!to && designer.model.has(from)) {
       const [x, y] = view.at(event.clientX, event.clientY);
       const isPlace = Boolean(designer.model.place(from));
       to = isPlace ? designer.model.addTransition(snap(x), snap(y)) : designer.model.addPlace("action", snap(x), snap(y));
     }
     await designer.connect(from, to);
     designer.tools.use(kept);
-    designer.choose(new Set([to]));
+    designer.choose(new Set([to ?? from]));
   }
 
   // ---- elements -----------------------------------------------------------------------------------------------------
