@@ -159,23 +159,29 @@ class BackgroundProcess:
 
 
 def analysed(
-    text: str, filename: str, cell: Mapping[str, Any] | None = None
+    text: str, filename: str, cell: Mapping[str, Any] | None = None, services: str = ""
 ) -> Iterator[dict[str, Any]]:
-    """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`.
+    """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`,
+    `services` is the path of its location file.
 
-    Yield the verdicts first, then the same with the forecast, because that may take long. Raises
-    TaskFileError.
+    Yield the verdicts, and all `findings` of `petrobot check`, first, then the same with the
+    forecast, because that may take long. Raises TaskFileError.
     """
     from petrobot.coordinator.analysis.may_run import BUDGET, Cell, devices_of
     from petrobot.coordinator.analysis.report import analyse, with_forecast
+    from petrobot.coordinator.operator.task_check import judge_text
     from petrobot.coordinator.task.file import loads
 
     task = loads(text, filename)
+    judgement = judge_text(text, filename, services, cell, search=True)
+    more = {"findings": judgement.findings()}
     known = None if cell is None else Cell(**cell)
     limits, devices = BUDGET.limits(), devices_of(known)
-    found = analyse(task, limits=limits, steps=BUDGET.steps, devices=devices)
-    yield _shown(found, known)
-    yield _shown(with_forecast(found, task, limits=limits, devices=devices), known)
+    found = judgement.judged.analysis if judgement.judged is not None else None
+    if found is None:  # not searched because of other errors: here it was asked for
+        found = analyse(task, limits=limits, steps=BUDGET.steps, devices=devices)
+    yield _shown(found, known) | more
+    yield _shown(with_forecast(found, task, limits=limits, devices=devices), known) | more
 
 
 def _shown(analysis: Analysis, cell: Cell | None) -> dict[str, Any]:

@@ -150,6 +150,13 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     return MayRun(task, report, replace(analysis, refused=not report.ok))
 
 
+def left_to_search(finding: Finding) -> bool:
+    """Return whether only a search of the states decides a finding: the arcs alone suggest it."""
+    if finding.code == UNCOVERED:
+        return finding.severity is Severity.NOTE
+    return finding.code in ("unsettled-conflict", "arrival-order", EXTERNAL_WAIT)
+
+
 def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> Analysis:
     from petrobot.coordinator.analysis.report import analyse
 
@@ -162,9 +169,8 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     suggest. Without a complete graph, those stand."""
     if analysis.progress is None or not analysis.progress.x.complete:
         return report
-    judged = ("unsettled-conflict", "arrival-order", EXTERNAL_WAIT)
-    open_ones = [f for f in report.findings if f.code == UNCOVERED and f.severity is Severity.NOTE]
-    rest = [f for f in report.findings if f.code not in judged and f not in open_ones]
+    open_ones = [f for f in report.findings if f.code == UNCOVERED and left_to_search(f)]
+    rest = [f for f in report.findings if not left_to_search(f)]
     may_stay = analysis.progress.may_stay
     rest += external_waits(analysis.progress.x.engine.compiled.task, may_stay=may_stay)
     flat = analysis.progress.x.engine.compiled.task

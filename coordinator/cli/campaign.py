@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_services_argument,
-    cell_of,
     cell_path,
     load_directory,
     load_task,
@@ -26,6 +25,7 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.coordinator.cli.options import refuse_idle
+from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.services.comm.location_file import physics_of
 from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
 

@@ -12,6 +12,7 @@ from threading import Timer
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -220,19 +221,6 @@ def cell_finder(given: Path | None, name: str) -> Callable[[Task], Cell | None]:
         return None if path is None else cell_of(load_directory(path))
 
     return of
-
-
-def cell_of(directory: Directory) -> Cell:
-    """Return what a location file offers to a task."""
-    from petrobot.coordinator.analysis.may_run import Cell
-
-    actions = directory.actions.values()
-    return Cell(
-        {action.name: action.node for action in actions},
-        str(directory.source),
-        {action.name: action.device for action in actions if action.device},
-        {action.name: action.task for action in actions if action.task},
-    )
 
 
 def objections(task: Task, cell: Cell, judged: MayRun | None = None) -> list[str]:

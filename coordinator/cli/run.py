@@ -16,7 +16,6 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_dry_run_argument,
     add_services_argument,
-    cell_of,
     cell_path,
     load_directory,
     load_task,
@@ -38,6 +37,7 @@ from petrobot.coordinator.cli.options import (
     refuse_idle,
     tidy,
 )
+from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.services.host.command_line import (
     LARGEST_SEED,
     MOST_RUNS,
@@ -408,6 +408,7 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
                 directory, lambda action, node: callers[node].up and action in callers[node].offers
             ),
             runs=session.folder.parent,
+            services=directory.source,
             page=not options.no_page,
         )
     if not options.no_page:

@@ -133,6 +133,7 @@ async def _page(
             offers=station.offers,
             runs=runs,
             starts=station.form,
+            services=station.directory.source,
         )
     station.address = _addresses(station.directory, page)
     try:

@@ -1,4 +1,5 @@
-"""Follow the active run until it ends: firings, starts and ends of actions, operators' commands."""
+"""Follow the active run until it ends: firings, starts and ends of actions, variables,
+operators' commands."""
 
 from __future__ import annotations
 
@@ -77,8 +78,12 @@ def _snapshot(state: Mapping[str, Any]) -> str:
     mission, controls, paused = state["mission"], state["controls"], state["paused"]
     tokens = ", ".join(f"{place} {n}" for place, n in state["marking"].items() if n)
     how = mission["state"] if paused is None else f"paused ({paused['reason']})"
+    known = ", ".join(
+        f"{n} = {json_text(v)}" for n, v in state["variables"].items() if "." not in n
+    )
     return (
         f"{mission['id']}: {how}; controls: {controls['holder'] or 'no operator'}; tokens: {tokens}"
+        + (f"; variables: {known}" if known else "")
     )
 
 
@@ -116,6 +121,10 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         f"started  {c['run']['id']}  {c['run']['action']} on {c['run']['node'] or 'no node'}"
     ),
     "run_ended": _ended,
+    # `PLACE.status` and the like are in the line about the run's end.
+    "variable": lambda c: (
+        "" if "." in c["name"] else f"variable {c['name']} = {json_text(c['value'])}"
+    ),
     "command": lambda c: f"command  {c['text']}",
     "paused": _paused,
     "mission": _mission,

@@ -36,11 +36,15 @@ class PageState:
     runs: Path | None = None
     """The folder that has a folder for each run."""
     starts: StartForm | None = None
+    services: str = ""
+    """The path of the location file; empty if only `offers` are known."""
     limit: ConnectionLimit | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
     apart: BackgroundProcess = field(default_factory=BackgroundProcess)
     """Process for work on documents and journals."""
+    checks: BackgroundProcess = field(default_factory=BackgroundProcess)
+    """Process that checks drawings. It imports the code of the location file, which may hang."""
     analyses: BackgroundProcess = field(default_factory=BackgroundProcess)
     """Process that analyses drawings. This takes long, so no other work waits for it."""
     closing: bool = False

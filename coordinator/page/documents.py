@@ -13,7 +13,7 @@ from typing import Any
 
 from aiohttp import web
 
-from petrobot.coordinator.background import RefusedError
+from petrobot.coordinator.background import BackgroundProcess, RefusedError
 from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
 from petrobot.coordinator.page.requests import json_answer, read_object, refused, send_json
 from petrobot.coordinator.page.task_store import StoreError
@@ -80,9 +80,8 @@ async def _check(request: web.Request) -> web.StreamResponse:
     body = await read_object(request)
     desk = _desk(body)
     page_state.analyses.give_up(desk)
-    return await _done(
-        request, "check", {**_drawing(page_state, body), "cell": _cell(page_state)}, desk
-    )
+    given = {**_drawing(page_state, body), **_known(page_state)}
+    return await _answered(request, page_state.checks, "check", given, desk)
 
 
 async def _analyse(request: web.Request) -> web.StreamResponse:
@@ -93,7 +92,7 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
     drawing = _drawing(page_state, body)
     try:
         text = json.loads(await page_state.apart.do("drawing", drawing))["text"]
-        given = {"text": text, "filename": f"{drawing['name']}.toml", "cell": _cell(page_state)}
+        given = {"text": text, "filename": f"{drawing['name']}.toml", **_known(page_state)}
         said = await page_state.analyses.do("analysis", given, _desk(body))
     except RefusedError as refusal:
         return _refusal(refusal)
@@ -142,12 +141,20 @@ async def _run(request: web.Request) -> web.StreamResponse:
     return await _done(request, "run", {"folder": str(runs), "run": request.match_info["run"]})
 
 
-async def _done(
-    request: web.Request, work: str, given: Mapping[str, Any], desk: str = ""
+async def _done(request: web.Request, work: str, given: Mapping[str, Any]) -> web.StreamResponse:
+    """Have work on documents or journals done, and pass on its result."""
+    return await _answered(request, request.app[PAGE_STATE].apart, work, given)
+
+
+async def _answered(
+    request: web.Request,
+    process: BackgroundProcess,
+    work: str,
+    given: Mapping[str, Any],
+    desk: str = "",
 ) -> web.StreamResponse:
-    """Have the work done in the other process, and pass on its result."""
     try:
-        said = await request.app[PAGE_STATE].apart.do(work, given, desk)
+        said = await process.do(work, given, desk)
     except RefusedError as refusal:
         return _refusal(refusal)
     return await send_json(request, said)
@@ -180,6 +187,11 @@ def _cell(page_state: PageState) -> dict[str, Any] | None:
         "offers": {str(offer["action"]): str(offer["node"]) for offer in offers},
         "devices": {str(o["action"]): str(o["device"]) for o in offers if o["device"]},
     }
+
+
+def _known(page_state: PageState) -> dict[str, Any]:
+    """Return what is known of the cell: the fields of its `Cell`, and its location file."""
+    return {"cell": _cell(page_state), "services": page_state.services}
 
 
 def _drawing(page_state: PageState, body: Mapping[str, Any]) -> dict[str, Any]:

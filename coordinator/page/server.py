@@ -59,7 +59,10 @@ class Page:
             async with asyncio.timeout(LAST_COMMANDS_S):
                 await self.idle()
         await asyncio.gather(*(session.leave() for session in self._page_state.sessions))
-        await asyncio.gather(self._page_state.apart.close(), self._page_state.analyses.close())
+        state = self._page_state
+        await asyncio.gather(
+            *(process.close() for process in (state.apart, state.checks, state.analyses))
+        )
         await self._runner.cleanup()
         for task in list(self._page_state.commands):
             task.cancel()
@@ -76,20 +79,28 @@ async def start_page(
     offers: Offers | None = None,
     runs: Path | None = None,
     starts: StartForm | None = None,
+    services: Path | None = None,
     page: bool = True,
 ) -> Page:
     """Serve the page of a mission; without `page`, only the operator protocol: WebSocket, snapshot
     and commands.
 
     Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and saving one makes a
-    copy there. `runs` has a folder for each recorded run. `port` 0 selects a free one. `token` is
+    copy there. `services` is the location file of the cell, whose code the check reads. `runs` has
+    a folder for each recorded run. `port` 0 selects a free one. `token` is
     random unless given. Raises OSError if the port cannot be used."""
     # It listens at once: until then, another process could still take the port.
     listener = sockets.create_server((HOST, port), backlog=128)
     number = listener.getsockname()[1]
     access = AccessRules(token or secrets.token_hex(24), number)
     page_state = PageState(
-        port_object, TaskStore(tasks_folder, shipped), access, offers, runs, starts
+        port_object,
+        TaskStore(tasks_folder, shipped),
+        access,
+        offers,
+        runs,
+        starts,
+        str(services.resolve()) if services else "",
     )
     runner = web.AppRunner(
         _application(page_state, page),

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import tomlkit
 
-from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of, may_run
+from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.background import RefusedError
+from petrobot.coordinator.operator.task_check import judge_text
 from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
 from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
 from petrobot.coordinator.task import Kind, Task
@@ -107,18 +108,11 @@ class ConvertedTask:
     content_type: str
 
 
-def findings(text: str, filename: str, cell: Fields) -> list[dict[str, Any]]:
-    """Return errors and warnings of the task: {severity, key, text, remedy}; errors first."""
-    try:
-        task = loads(text, filename)
-    except TaskFileError as error:
-        return [_finding("error", fault.key, fault.text, fault.remedy) for fault in error.faults]
-    report = may_run(task, None if cell is None else Cell(**cell)).report
-    return [_finding(f.severity.value, f.key, f.text, f.remedy) for f in report.findings]
-
-
-def _finding(severity: str, key: str, text: str, remedy: str) -> dict[str, Any]:
-    return {"severity": severity, "key": key, "text": text, "remedy": remedy}
+def findings(text: str, filename: str, cell: Fields, services: str = "") -> list[dict[str, Any]]:
+    """Return errors and warnings of the task: {severity, key, text, remedy, line}; errors first.
+    With the path of a location file those about its code, too. Those that only a search of the
+    states decides come with the analysis."""
+    return judge_text(text, filename, services, cell, search=False).findings()
 
 
 def load(text: str, filename: str) -> Task:
@@ -236,10 +230,10 @@ def _drawn(
         raise _refused(fault) from fault
 
 
-def _check(cell: Fields, name: str, **drawing: Any) -> dict[str, Any]:
+def _check(cell: Fields, services: str, name: str, **drawing: Any) -> dict[str, Any]:
     """Return the text that a drawing would be saved as, and the findings of the check."""
     made = _drawn(name=name, **drawing)
-    return {"findings": findings(made["text"], f"{name}.toml", cell), **made}
+    return {"findings": findings(made["text"], f"{name}.toml", cell, services), **made}
 
 
 def _export(tasks: str, shipped: str, name: str, form: str, cell: Fields) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from experiments.against_trees.judge import violations
 from experiments.against_trees.missions import Mission, Run, net_mission, program_mission
 from experiments.against_trees.results import CELL, HERE, PLANT, ROOT, TASK, Line, Results, Size
 from petrobot.coordinator.analysis.may_run import BUDGET, may_run
-from petrobot.coordinator.cli.loading import cell_of
+from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.coordinator.task.file import TaskFileError, loads
 from petrobot.coordinator.task.wording import Severity
 from petrobot.services.comm.location_file import load

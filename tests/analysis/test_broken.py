@@ -15,8 +15,9 @@ from petrobot.coordinator.analysis.may_run import BUDGET, may_run
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.analyse import draw_witnesses, refused
-from petrobot.coordinator.cli.loading import cell_of, load_directory
+from petrobot.coordinator.cli.loading import load_directory
 from petrobot.coordinator.drawing import Overlay, draw
+from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.file import dumps, load
 from petrobot.coordinator.task.net import Net

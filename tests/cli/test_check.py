@@ -15,8 +15,17 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.analysis import may_run
+from petrobot.coordinator.background import analysed
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.cli.loading import cell_of, load_directory, load_task, objections
+from petrobot.coordinator.cli.loading import (
+    find_cell,
+    load_directory,
+    load_task,
+    objections,
+    task_path,
+)
+from petrobot.coordinator.operator.task_check import cell_of
+from petrobot.coordinator.page.task_work import findings
 from petrobot.coordinator.task.conditions import parse
 from petrobot.services.comm.location_file import load
 from petrobot.services.comm.location_file.code import read_code
@@ -40,6 +49,32 @@ look = { kind = "action", task = "look" }
 next = { in = ["parts", "arm"], out = ["look"] }
 seen = { in = ["look:normal"], out = ["arm"] }
 """
+
+
+ROOT = Path(__file__).parents[2]
+TASKS = [
+    *(path.stem for path in sorted((ROOT / "coordinator" / "tasks").glob("*.toml"))),
+    *(
+        str(path)
+        for path in sorted((ROOT / "examples").glob("*/*.toml"))
+        if path.name != "services.toml"
+    ),
+]
+"""All tasks that come with petrobot."""
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("name", TASKS, ids=lambda name: Path(name).stem)
+def test_the_page_finds_what_check_finds(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Both lists are equal, with the findings about the code and those that the states decide. What
+    the page says before the search does not contradict them."""
+    main(["check", name, "--json", "-"])
+    told = json.loads(capsys.readouterr().out)["findings"]
+    path, task = task_path(name), load_task(name)
+    services = str(find_cell(None, name, task) or "")
+    given = (path.read_text(encoding="utf-8"), path.name, None, services)
+    assert [f for f in told if f["key"] != "services.toml"] == next(analysed(*given))["findings"]
+    assert all(finding in told for finding in findings(*given))
 
 
 def printed(

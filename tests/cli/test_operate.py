@@ -272,6 +272,27 @@ async def test_watch_shows_tokens_and_events_of_the_operator(petrobot: Terminal)
     ]
 
 
+async def test_watch_shows_variables(
+    petrobot: Terminal, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those known at its beginning, and each new value."""
+    petrobot.operation.feed.state["variables"]["bin"] = None
+    watching = asyncio.create_task(petrobot("watch"))
+    printed = list[str]()
+
+    def shows(line: str) -> bool:
+        printed.append(capsys.readouterr().out)
+        return f"{line}\n" in "".join(printed)
+
+    await until(lambda: shows("variables: bin = null"))
+    petrobot.operation.feed.emit("variable", time=1.0, name="look.status", value="success")
+    petrobot.operation.feed.emit("variable", time=1.0, name="bin", value="left")
+    await until(lambda: shows('variable bin = "left"'))
+    assert "look.status" not in "".join(printed)
+    await petrobot("abort")
+    await watching
+
+
 async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
     """The reason names the operator."""
     watching = asyncio.create_task(petrobot("watch"))

@@ -19,6 +19,7 @@ from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.page.sessions import Session
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.task import Executed, Status
+from petrobot.coordinator.task.file import load
 from tests.page.conftest import (
     PATIENCE_MS,
     abort,
@@ -654,3 +655,36 @@ async def test_the_emergency_stop_can_be_pressed_in_every_dialog(
     await expect(dialog).to_be_hidden()
     await until(lambda: len(stage.commands) > 1)
     assert [verb for _, verb, _ in stage.commands] == ["estop", "estop"]
+
+
+async def test_values_are_shown_where_they_are_used(
+    browser: Browser, page: Page, stage: Stage, tasks: Path
+) -> None:
+    """A transition shows what its condition reads, a place the values of its arguments, and the
+    list of variables has one line for each place's last run."""
+    text = (tasks / "pick_and_place.toml").read_text()
+    condition = "when = \"bin == 'left' and look.status == 'success'\"\n"
+    text = text.replace('out = ["put"]\n', f'out = ["put"]\n{condition}')
+    text = text.replace('task = "put"\n', 'task = "put"\nargs = { to = { var = "bin" } }\n')
+    path = tasks / "binned.toml"
+    path.write_text(text + '\n[variables]\nbin = { type = "str" }\n')
+    tab = await opened(browser, page)
+    stage.load(load(path))
+    selected = tab.get_by_role("region", name="Selected")
+    await element(tab, "^Transition picked", "Task net").click()
+    stage.feed.emit("variable", time=1.0, name="look.status", value="success")
+    stage.feed.emit("variable", time=1.0, name="bin", value="left")
+    await expect(selected).to_contain_text("bin = left, look.status = success")
+    await element(tab, "^Action place put", "Task net").click()
+    await expect(selected).to_contain_text("to = $bin (now left)")
+    for name, value in (("pick.status", "error"), ("pick.reason", "slipped")):
+        stage.feed.emit("variable", time=1.0, name=name, value=value)
+    await tab.get_by_role("tab", name="Variables").click()
+    shown = tab.get_by_role("tabpanel", name="Variables")
+    await expect(shown.get_by_role("row")).to_have_text(
+        [
+            "binleft",
+            "last run of lookstatus success",
+            "last run of pickstatus error, reason slipped",
+        ]
+    )

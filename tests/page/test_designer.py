@@ -18,6 +18,7 @@ import pytest
 from petrobot.coordinator.drawing.layout import COLUMN, WIDEST, lay_out
 from petrobot.coordinator.page.edits import edited, parse, plain
 from petrobot.coordinator.page.server import Page
+from petrobot.coordinator.task.expansion import with_error_branches
 from petrobot.coordinator.task.file import load
 from tests.drawing.conftest import random_task
 from tests.page.conftest import (
@@ -35,7 +36,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Locator, Route, WebSocketRoute, expect
 from playwright.async_api import Page as Tab
 
-from tests.page.steps import element, settled
+from tests.page.steps import click_canvas, element, settled
 from tests.waiting import until
 
 DRAWING = "Drawing of the task"
@@ -522,6 +523,73 @@ def long_net(seed: int) -> Drawn:
     for i in random.integers(len(chain), size=6).tolist():
         edges.append((chain[i], "arm") if i % 2 else ("base", chain[i]))
     return [*chain, "arm", "base"], edges, ["n0", "arm", "base"], ["arm", "base"]
+
+
+ERRORS = """
+[places.given_up]
+kind = "control"
+x = 560
+y = 480
+
+[errors]
+to = "given_up"
+"""
+
+
+async def test_error_branches_of_the_table_errors_are_drawn(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """What `[errors]` makes is drawn and folded as any error branch, near its neighbours.
+    It is chosen and explained, but not moved or deleted, until another branch is drawn there."""
+    path = tasks / "gives_up.toml"
+    text = (tasks / "pick_and_place.toml").read_text()
+    for name in ("not_seen", "put_failed", "stuck"):
+        text = re.sub(rf"\[transitions\.{name}\]\n([^\n]+\n)+", "", text)
+    path.write_text(text + ERRORS)
+    task = with_error_branches(load(path))
+    made = {t.name for t in task.transitions.values() if t.expanded_from}
+    assert made == {"look.error", "put.error", "clear.error"}
+    tab, complaints = await designing(browser, page, "gives_up")
+    names = "[...document.querySelectorAll('.designer .element.transition')]"
+    drawn = await tab.evaluate(f"{names}.map((node) => node.dataset.name)")
+    assert {*drawn} == {*task.transitions}
+    one = element(tab, "^Transition put[.]error")
+    await expect(one).to_have_attribute("data-error", "")
+    place, branch = (
+        await element(tab, "^Action place put,").bounding_box(),
+        await one.bounding_box(),
+    )
+    assert place and branch and abs(branch["y"] - place["y"]) < 320
+    await tab.get_by_role("button", name="Error branches").click()
+    await expect(one).to_be_hidden()
+    await tab.get_by_role("button", name="Error branches").click()
+    await one.click()
+    await expect(properties(tab)).to_contain_text("made by the table errors")
+    await drag(tab, "^Transition put[.]error", 80, 40)
+    await tab.keyboard.press("Delete")
+    await toasted(tab, "made by the table errors")
+    await expect(one).to_be_visible()
+    for arc in ("Arc (error) from put to put.error", "Arc from put.error to given_up"):
+        await tab.get_by_role("button", name=arc).focus()
+        await tab.keyboard.press("Enter")
+        await tab.keyboard.press("Delete")
+    await tab.keyboard.press("a")
+    await choose(tab, "^Action place put,", "^Transition put[.]error")
+    await tab.keyboard.press("Escape")
+    await tab.keyboard.press("a")
+    await drag(tab, "^Transition put[.]error", 0, 150)  # to free ground: nothing is left there
+    await tab.keyboard.press("Escape")
+    await expect(tab.locator(".saved")).to_have_text("saved")
+    await choose(tab, "^Action place put,")
+    await properties(tab).get_by_role("button", name="Add error branch").click()
+    await expect(element(tab, "^Transition put_error")).to_be_visible()
+    await expect(one).to_have_count(0)
+    await click_canvas(tab, 0.5, 0.02)
+    await properties(tab).get_by_label("Errors without a branch").select_option("")
+    await expect(element(tab, "^Transition look[.]error")).to_have_count(0)
+    await save(tab)
+    assert "[errors]" not in path.read_text()
+    assert complaints == []
 
 
 COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,12 @@ from petrobot.coordinator.page import edits
 from petrobot.coordinator.page import task_store as store
 from petrobot.coordinator.page import task_work as verdicts
 from petrobot.coordinator.page.access import HEADERS
-from petrobot.coordinator.page.server import Page
+from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.page.task_work import as_task_file
 from petrobot.coordinator.task.file import load, loads
 from petrobot.services.comm import location_file
 from tests.page.stage import Stage
+from tests.waiting import until
 
 pytestmark = pytest.mark.processes
 
@@ -39,7 +41,7 @@ FORBIDDEN = (
     (store, "parse"),
     (verdicts, "parse"),
     (verdicts, "loads"),
-    (verdicts, "may_run"),
+    (verdicts, "judge_text"),
     (pnml, "parse_pnml"),
     (journals, "read_journal"),
     (journals, "replay"),
@@ -352,6 +354,70 @@ async def test_long_computations_never_run_in_the_coordinators_process(
     async with http.get(f"/api/runs/{run['id']}") as answer:
         assert answer.status == 200 and (await answer.json())["records"]
         assert answer.headers.keys() >= HEADERS.keys()
+
+
+CELL = """schema = 1
+[nodes.pc]
+host = "127.0.0.1"
+port = 7501
+[actions]
+look__edges = { run = "hands_of_this_test:look", node = "pc", task = "look" }
+look__template = { run = "hands_of_this_test:look", node = "pc", task = "look" }
+pick = { run = "hands_of_this_test:pick", node = "pc" }
+put = { run = "hands_of_this_test:put", node = "pc" }
+clear = { run = "hands_of_this_test:clear", node = "pc" }
+"""
+HANDS = """import pathlib, threading
+here = pathlib.Path(__file__).parent
+(here / "importing.txt").touch()
+if (here / "hangs.txt").exists():
+    threading.Event().wait()
+from petrobot import success
+async def look(ctx):
+    return success()
+async def pick(ctx, *, force):
+    return success()
+async def put(ctx):
+    return success()
+async def clear(ctx):
+    await ctx.raise_event("part_there")
+    return success()
+"""
+
+
+async def test_the_check_reads_the_code_of_the_cell_and_may_hang_alone(
+    stage: Stage, tasks: Path, tmp_path: Path
+) -> None:
+    """An import that never ends keeps no other work waiting, and a newer drawing ends it. The
+    coordinator's process imports nothing."""
+    cell, task = tmp_path / "services.toml", "pick_and_place"
+    cell.write_text(CELL)
+    (tmp_path / "hands_of_this_test.py").write_text(HANDS)
+    hangs, importing = tmp_path / "hangs.txt", tmp_path / "importing.txt"
+    hangs.touch()
+    made = await start_page(stage, tasks_folder=tasks, offers=stage.offers, services=cell)
+    headers = {"Authorization": f"Bearer {made.token}"}
+    async with aiohttp.ClientSession(made.base, headers=headers) as http, asyncio.timeout(120):
+        drawn = {"name": task, "document": (await opened(http))["document"], "desk": "mine"}
+
+        async def post(path: str) -> Any:
+            async with http.post(path, json=drawn) as answer:
+                return await answer.json()
+
+        older = asyncio.create_task(post("/api/check"))
+        await until(importing.exists, "the import")
+        assert (await opened(http))["findings"] == []  # by another process
+        hangs.unlink()
+        found = {f["key"]: f["text"] for f in (await post("/api/check"))["findings"]}
+        assert "needs the argument 'force'" in found["places.pick.args"], found
+        assert await older == {"superseded": True}
+        drawn["document"]["places"]["pick"]["args"] = {"force": 2.0}
+        for path in ("/api/check", "/api/analyse"):
+            told = (await post(path))["findings"]
+            assert {f["severity"] for f in told} <= {"warning", "note"}, told
+            assert any("raises the event 'part_there'" in f["text"] for f in told), told
+    await made.close()
+    assert "hands_of_this_test" not in sys.modules
 
 
 async def test_an_outdated_drawing_is_answered_without_an_error(

@@ -39,6 +39,9 @@ from petrobot.coordinator.task import Status, Task
 ROW, LEFT, WIDTH = 26, 150, 1040
 SECOND = 10.0
 """Least number of pixels per second; a long Gantt chart becomes wider than the page."""
+LETTER = 13.0
+"""Width of the narrowest bar that gets a letter: a letter with its halo (pixels). On a shorter bar
+it would cover the bars beside it."""
 LONGEST = 600.0
 """Seconds shown in a Gantt chart; the table of firings lists the rest."""
 
@@ -141,7 +144,8 @@ def _bar(bar: Bar, row: int, scale: float, end: float, left: int) -> str:
     tip = f"<title>{escape(f'{name}, {how}{why}')}</title>"
     return (
         f'<rect x="{x:.2f}" y="{ROW * row + 5}" width="{width:.2f}" height="{ROW - 9}" '
-        f'rx="3" fill="{colour}">{tip}</rect>' + _letter(bar, x + width / 2, row)
+        f'rx="3" fill="{colour}">{tip}</rect>'
+        + (_letter(bar, x + width / 2, row) if width >= LETTER else "")
     )
 
 

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import binomtest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.campaign.conduct import Campaign
 from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.table import TrialRow
@@ -31,7 +32,8 @@ from petrobot.coordinator.studies.report.comparing import (
     paired,
 )
 from petrobot.coordinator.studies.report.plots import declared, finished
-from petrobot.coordinator.studies.report.run_page import own_pictures
+from petrobot.coordinator.studies.report.run_page import gantt_svg, own_pictures
+from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load
 from tests.studies.campaign.conftest import HERE, SERVICES, TASK, InlinePool
 
@@ -511,3 +513,16 @@ def test_a_learning_picture_has_the_first_trial_and_the_last(
             assert (points[0][0], points[-1][0]) == (1, 12)
             even = pytest.approx(1 / len(one.probability), abs=1e-6)
             assert selector == "random" or points[0][1] == even
+
+
+# --- the Gantt chart ----------------------------------------------------------------------------
+
+
+def test_a_letter_that_does_not_fit_its_bar_is_left_out() -> None:
+    """Many short failures in a row: no letter reaches over the bars beside it. The one of a long
+    run stays."""
+    short = [Bar(f"s{i}", "look", "look", i / 10, (i + 0.9) / 10, Status.FAILURE) for i in range(9)]
+    long = Bar("long", "look", "look", 1.0, 10.0, Status.ERROR)
+    svg = gantt_svg(Timeline({bar.run: bar for bar in (*short, long)}))
+    assert svg.count("<rect") == 10
+    assert re.findall(r">([FEP])</text>", svg) == ["E"]

@@ -131,5 +131,8 @@ export function seconds(value) {
   return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")} min`;
 }
 
+/** A value for people: a text as it is, a missing one as a dash. */
+export const valueText = (value) => (typeof value === "string" ? value : value === null || value === undefined ? "–" : JSON.stringify(value));
+
 /** A name for people: underscores become spaces. */
 export const words = (name) => String(name ?? "").replaceAll("_", " ");

@@ -60,7 +60,7 @@ function folded(spots, columns) {
 }
 
 /** The positions with those of the other nodes: each near its neighbours, at the nearest free spot. */
-function filledIn(names, positions, edges) {
+export function filledIn(names, positions, edges) {
   const at = { ...positions };
   for (const name of names.filter((n) => !(n in at))) {
     const near = edges.filter((edge) => edge.includes(name)).map(([a, b]) => at[a === name ? b : a]).filter(Boolean);

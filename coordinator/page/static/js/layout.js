@@ -1,15 +1,20 @@
 // Automatic layout: by the button, and for elements without a position.
 
 import { snap } from "./geometry.js";
-import { layered } from "./layers.js";
+import { filledIn, layered } from "./layers.js";
 
 let last = { key: "", positions: {} }; // a net without positions is drawn again at each edit
+
+/** The arcs as pairs of names [from, to], those of elements that are not drawn left out. */
+function edgesOf(net) {
+  const known = new Set([...net.places, ...net.transitions].map((e) => e.name));
+  return net.arcs.filter((a) => known.has(a.place) && known.has(a.transition)).map((a) => (a.direction === "out" ? [a.transition, a.place] : [a.place, a.transition]));
+}
 
 /** Positions {name: [x, y]} for a net {places, transitions, arcs}, left to right along the flow of tokens. */
 export function automatic(net) {
   const names = [...net.places, ...net.transitions].map((e) => e.name);
-  const known = new Set(names);
-  const edges = net.arcs.filter((a) => known.has(a.place) && known.has(a.transition)).map((a) => (a.direction === "out" ? [a.transition, a.place] : [a.place, a.transition]));
+  const edges = edgesOf(net);
   const sources = net.places.filter((p) => p.tokens).map((p) => p.name);
   const aside = net.places.filter((p) => p.kind === "resource" && p.tokens).map((p) => p.name);
   const key = JSON.stringify([names, edges, sources, aside]);
@@ -17,12 +22,18 @@ export function automatic(net) {
   return Object.fromEntries(Object.entries(last.positions).map(([name, [x, y]]) => [name, [snap(x), snap(y)]]));
 }
 
-/** The net with a position for every element: its own if it has one, otherwise next to the others by automatic layout. */
+/** The net with a position for every element: its own if it has one. Where most have one, the others go next to their neighbours, else below, by automatic layout. */
 export function placed(net) {
   const around = net.transitions.filter((t) => t.outside);
   if (around.length) return beside(placed({ ...net, transitions: net.transitions.filter((t) => !t.outside) }), around);
   const all = [...net.places, ...net.transitions];
-  if (all.every((e) => Number.isFinite(e.x) && Number.isFinite(e.y))) return net;
+  const given = all.filter((e) => Number.isFinite(e.x) && Number.isFinite(e.y));
+  if (given.length === all.length) return net;
+  if (2 * given.length >= all.length) {
+    const at = filledIn(all.map((e) => e.name), Object.fromEntries(given.map((e) => [e.name, [e.x, e.y]])), edgesOf(net));
+    const put = (e) => ({ ...e, x: Math.round(at[e.name][0]), y: Math.round(at[e.name][1]) });
+    return { ...net, places: net.places.map(put), transitions: net.transitions.map(put) };
+  }
   const positions = automatic(net);
   const set = (e) => ({ ...e, x: positions[e.name][0], y: positions[e.name][1] });
   const some = all.some((e) => Number.isFinite(e.x));

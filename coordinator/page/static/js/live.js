@@ -3,7 +3,7 @@
 import { Cameras, Devices } from "./camera.js";
 import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
-import { attribute, fill, h, Press, rows, seconds, text, words } from "./dom.js";
+import { attribute, fill, h, Press, rows, seconds, text, valueText, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
@@ -105,7 +105,7 @@ export class Live {
     if (dirty("selectors")) this.selectors.paint();
     if (dirty("selectors")) this.paintHeat();
     if (dirty("result", "mission")) this.paintResult();
-    if (dirty("marking", "runs", "breakpoints", "events", "controls", "firings", "connection")) this.selected.update(this.link.state, this.link.now());
+    if (dirty("marking", "runs", "breakpoints", "events", "controls", "firings", "variables", "connection")) this.selected.update(this.link.state, this.link.now());
     this.dock.paint(changed);
   }
 
@@ -296,6 +296,17 @@ export function reasonText(firing) {
   return `${who}${reason.text || words(reason.code)}${reason.code && reason.text ? ` [${reason.code}]` : ""}${done}`;
 }
 
+/** The variables, and then a line for each place: how its last run ended, as conditions read it. */
+function valuesShown({ variables }) {
+  const runs = new Map();
+  for (const [name, value] of Object.entries(variables)) {
+    const place = name.includes(".") ? name.slice(0, name.lastIndexOf(".")) : "";
+    if (place && value !== "") runs.set(place, [...(runs.get(place) ?? []), `${name.slice(place.length + 1)} ${valueText(value)}`]);
+  }
+  const own = Object.entries(variables).filter(([name]) => !name.includes("."));
+  return Object.fromEntries([...own, ...[...runs].map(([place, said]) => [`last run of ${place}`, said.join(", ")])]);
+}
+
 /** The lower part: timeline, set points, images, devices, learning, variables. */
 class Dock {
   constructor(link, chosen, heated) {
@@ -345,7 +356,7 @@ class Dock {
     if (this.shown === "Camera" && dirty("images")) this.cameras.update(state.images);
     if (this.shown === "Devices" && dirty("devices")) this.devices.update(state.devices);
     if (this.shown === "Learning" && (dirty("reports") || dirty("selectors"))) this.learning.update(state);
-    if (this.shown === "Variables" && dirty("variables")) this.paintTable(this.table, state.variables, "No variable is known.");
+    if (this.shown === "Variables" && dirty("variables")) this.paintTable(this.table, valuesShown(state), "No variable is known.");
     if (this.shown === "Events" && dirty("events")) this.paintEvents(state);
   }
 
@@ -372,7 +383,7 @@ class Dock {
   paintTable(host, values, empty) {
     const list = Object.entries(values);
     if (!list.length) return fill(host, h("p", { class: "empty" }, empty));
-    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, typeof value === "string" ? value : value === null ? "–" : JSON.stringify(value)))))));
+    return fill(host, h("table", {}, h("tbody", {}, list.map(([name, value]) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, valueText(value)))))));
   }
 
   paintEvents(state) {

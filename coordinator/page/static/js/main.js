@@ -23,7 +23,7 @@ class App {
     this.banner = new Banner();
     this.tabs = { Live: new Live(this.link, this.operator), Design: new Designer(this.link, this.operator), History: new History(this.link, this.operator) };
     this.lost = new LostBar(this.link);
-    this.switch = h("nav", { class: "switch", role: "tablist", "aria-label": "Views" }, Object.keys(this.tabs).map((name) => h("button", { type: "button", role: "tab", onclick: () => this.show(name) }, name)));
+    this.switch = h("nav", { class: "switch", role: "tablist", "aria-label": "Views" }, Object.keys(this.tabs).map((name) => h("button", { type: "button", role: "tab", onclick: () => this.show(name), onkeydown: (e) => this.step(e) }, name)));
     this.theme = h("button", { type: "button", class: "tool", onclick: () => this.setTheme(this.dark ? "light" : "dark") });
     this.wall = h("button", { type: "button", class: "tool", "aria-label": "Wall screen: larger type", title: "Wall screen: larger type", "aria-pressed": "false", onclick: () => this.setWall(!this.isWall) }, icon("wall"));
     this.header = h("header", { class: "top" }, h("span", { class: "brand" }, mark(), "petrobot"), this.switch, this.banner.root, h("div", { class: "spacer" }), this.wall, this.theme, this.operator.estop);
@@ -35,6 +35,15 @@ class App {
     setInterval(() => this.tick(), TICK_MS);
     new ResizeObserver(() => document.documentElement.style.setProperty("--head", `${this.header.offsetHeight}px`)).observe(this.header); // dialogs leave it free
     addEventListener("hashchange", () => this.addressed() && this.show(this.addressed()));
+  }
+
+  /** Go to the next view by the arrow keys. */
+  step(event) {
+    const way = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    const all = [...this.switch.children];
+    const next = all[(all.indexOf(event.currentTarget) + way + all.length) % all.length];
+    next?.click();
+    next?.focus();
   }
 
   /** The tab that the address names (…#design). */

@@ -1,6 +1,6 @@
 // What is known of the chosen place or transition, what it waits for, and what the operator may do with it.
 
-import { fill, h, Press, seconds, words } from "./dom.js";
+import { fill, h, Press, seconds, valueText, words } from "./dom.js";
 import { icon } from "./icons.js";
 import { caption } from "./sheet.js";
 
@@ -11,6 +11,19 @@ const action = (name, label, onclick, why = "") =>
 /** Whether the run that an arc waits for has ended as the arc wants: none is active in its place, and the last one ended so. */
 const ended = (state, { place, end }) =>
   !Object.values(state.runs).some((run) => run.place === place) && (state.ended.findLast((run) => run.place === place)?.status === "error") === (end === "error");
+
+const NAMES = /"[^"]*"|'[^']*'|[\p{L}_][\p{L}\p{N}_.]*/gu;
+
+/** The present values of the variables that a text of the element `name` reads, by their names; in a subnet, those inside it come first. */
+function valuesIn(state, text, name) {
+  const inside = name.slice(0, name.lastIndexOf(".") + 1);
+  const found = new Map();
+  for (const [word] of String(text).matchAll(NAMES)) {
+    const key = [inside + word, word].find((one) => Object.hasOwn(state.variables, one));
+    if (key) found.set(word, valueText(state.variables[key]));
+  }
+  return found;
+}
 
 export class Selected {
   constructor(link, operator, open) {
@@ -31,7 +44,7 @@ export class Selected {
     if (this.root.hidden) return;
     const run = place ? Object.values(state.runs).find((r) => r.place === this.name) : null;
     const stop = state.breakpoints.includes(`${place ? "places" : "transitions"}.${this.name}`);
-    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.barred, state.mission.id, state.mission.state, transition && this.missing(state, transition), this.lastFiring(state)?.number]);
+    const key = JSON.stringify([this.name, state.marking[this.name], run?.id, run?.state, stop, this.link.barred, state.mission.id, state.mission.state, transition && this.missing(state, transition), transition && this.values(state, transition), place && this.arguments(state, place), this.lastFiring(state)?.number]);
     if (key === this.key) return;
     if (this.drawn === this.name && this.press.holds(() => this.update(this.link.state, this.link.now()))) return;
     Object.assign(this, { key, drawn: this.name });
@@ -55,6 +68,8 @@ export class Selected {
     const left = state.marking[`${place.name}.left`];
     if (left !== undefined && state.task.places.some((p) => p.made_from === place.name)) facts.push(["Tries left", left]);
     if (place.primitive_task) facts.push(["Primitive task", words(place.primitive_task)]);
+    const given = this.arguments(state, place);
+    if (given) facts.push(["Arguments", given]);
     const primitive = state.task.primitive_tasks[place.primitive_task];
     if (primitive?.goal) facts.push(["Goal", primitive.goal]);
     if (primitive?.deadline) facts.push(["Deadline", seconds(primitive.deadline)]);
@@ -84,6 +99,8 @@ export class Selected {
     const facts = [];
     const text = caption(transition);
     if (text) facts.push(["Fires on", text]);
+    const values = this.values(state, transition);
+    if (values) facts.push(["Values", values]);
     facts.push(["Now", this.missing(state, transition) || "can fire"]);
     const last = this.lastFiring(state);
     if (last) facts.push(["Last fired", `at ${seconds(last.at)}: ${last.cause ?? ""}`]);
@@ -104,6 +121,18 @@ export class Selected {
     return state.firings.findLast((f) => f.transition === this.name);
   }
 
+  values(state, transition) {
+    return [...valuesIn(state, transition.when, transition.name)].map(([name, value]) => `${name} = ${value}`).join(", ");
+  }
+
+  /** What the runs of a place are given, with the present values of variables among it. */
+  arguments(state, place) {
+    return Object.entries(place.args ?? {}).map(([key, value]) => {
+      const [now] = String(value).startsWith("$") ? valuesIn(state, value.slice(1), place.name).values() : [];
+      return `${key} = ${valueText(value)}${now === undefined ? "" : ` (now ${now})`}`;
+    }).join(", ");
+  }
+
   /** What keeps a transition from firing, in words. */
   missing(state, transition) {
     const waits = [];
@@ -114,6 +143,8 @@ export class Selected {
       else if (arc.direction === "inhibit" && tokens >= arc.weight) waits.push(`${words(arc.place)} to hold ${arc.weight > 1 ? `fewer than ${arc.weight} tokens` : "no token"}`);
     }
     for (const event of transition.events ?? []) if (!state.events[event.name]?.armed) waits.push(`the event ${words(event.name)}`);
+    if (!waits.length && transition.when) return "can fire when its condition holds";
+    if (!waits.length && transition.after) return `can fire after ${seconds(transition.after)}`;
     return waits.length ? `waits for ${waits.join(", ")}` : "";
   }
 }

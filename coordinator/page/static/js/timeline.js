@@ -120,15 +120,10 @@ export class Timeline {
   }
 
   barLabel(pen, bar) {
-    if (bar.w < 70 * this.em) return;
-    pen.save();
-    pen.beginPath();
-    pen.rect(bar.x, bar.y, bar.w - 6, bar.h);
-    pen.clip();
     pen.fillStyle = this.colour("on-colour");
     pen.font = `${11 * this.em}px system-ui, sans-serif`;
-    pen.fillText(words(bar.run.action), bar.x + 6, bar.y + 11.5 * this.em);
-    pen.restore();
+    const said = words(bar.run.action);
+    if (pen.measureText(said).width <= bar.w - 12) pen.fillText(said, bar.x + 6, bar.y + 11.5 * this.em);
   }
 
   under(event) {

@@ -7,8 +7,10 @@ import { automatic } from "../layout.js";
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 const span = (elements, axis) => Math.max(...elements.map((e) => e[axis])) - Math.min(...elements.map((e) => e[axis]));
 
-/** The chosen elements that have a place of their own here: those around an opened macro place are put by themselves. */
-const movable = (designer) => designer.selected.elements.filter((e) => !e.outside);
+/** Whether an element has a position of its own here: those around an opened macro place, and what `errors` makes, are put by themselves. */
+export const isMovable = (e) => !e.outside && !e.made;
+
+const movable = (designer) => designer.selected.elements.filter(isMovable);
 
 const place = (elements, axis, at) => Object.fromEntries(elements.map((e, i) => [e.name, axis === "x" ? [at(i), e.y] : [e.x, at(i)]]));
 
@@ -31,9 +33,8 @@ export function distribute(designer) {
 
 /** Automatic layout of the sheet, or of the chosen elements around their present position. */
 export function layOut(designer) {
-  const own = (e) => !e.outside;
   const { picture } = designer;
-  const net = { ...picture, places: picture.places.filter(own), transitions: picture.transitions.filter(own) };
+  const net = { ...picture, transitions: picture.transitions.filter(isMovable) };
   const names = new Set(movable(designer).map((e) => e.name));
   const some = names.size > 1;
   const chosen = (e) => !some || names.has(e.name);

@@ -14,7 +14,7 @@ import { Inspector } from "./inspector.js";
 import { KeyHelp, Keys } from "./keys.js";
 import { chooseInside } from "./inside.js";
 import { around, groups } from "./macros.js";
-import { Model } from "./model.js";
+import { MADE, Model } from "./model.js";
 import { Pointer } from "./pointer.js";
 import { Selection } from "./selection.js";
 import { Toolbox } from "./toolbox.js";
@@ -190,6 +190,10 @@ export class Designer {
   removeChosen() {
     const { names, arc } = this.selection;
     if (!names.size && !arc) return;
+    if ([...names, ...(arc ? [arc.transition] : [])].every((name) => !this.model.has(name))) {
+      toast("info", MADE);
+      return;
+    }
     this.model.remove(names, arc ? [arc] : []);
     this.choose(new Set());
   }

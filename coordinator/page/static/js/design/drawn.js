@@ -2,7 +2,7 @@
 
 import { words } from "../dom.js";
 import { caption, onlyErrors } from "../sheet.js";
-import { arcsOf, listed } from "./arcs.js";
+import { arcsOf, listed, readArc } from "./arcs.js";
 import { around, drawnAs, groups, within } from "./macros.js";
 
 /** What a file may leave out: an action place does the primitive task of its name, the action of its name does that, and an event that names who raises it is internal. */
@@ -11,7 +11,8 @@ export const actionsOf = (name, primitive) => primitive?.alternatives ?? [name];
 export const scopeOf = (event) => event?.scope ?? (event?.by === undefined ? "external" : "internal");
 
 /** The drawing {places, transitions, arcs} of a net of the document, where the macro place `inside` is opened. */
-export function drawn(data, net, inside) {
+export function drawn(data, written, inside) {
+  const net = withErrorBranches(data, written);
   const shown = drawnAs(net, inside);
   const errors = errorElements(net);
   const names = new Set(shown.values());
@@ -21,6 +22,17 @@ export function drawn(data, net, inside) {
     .map(([name, t]) => transitionOf(data, name, t, errors.has(name), !here(t)));
   const places = Object.entries(net.places ?? {}).filter(([name]) => names.has(name)).map(([name, p]) => placeOf(data, net, name, p, errors));
   return onlyErrors({ places, transitions: transitions.map((t) => ({ ...t, sub: caption(t) })), arcs: arcs(net, transitions, shown) });
+}
+
+/** The net with the error branches that its table `errors` makes: one for each place that can end in error and has none. */
+function withErrorBranches(data, net) {
+  const to = net.errors?.to;
+  if (!to || !net.places?.[to]) return net;
+  const handled = new Set(Object.values(net.transitions ?? {}).flatMap((t) => listed(t.in).map(readArc)).filter((a) => a?.end === "error").map((a) => a.place));
+  const canFail = (p) => p.kind === "action" || (p.kind === "macro" && Boolean(data.subnets?.[p.subnet]?.error));
+  const made = Object.entries(net.places).filter(([name, p]) => name !== to && canFail(p) && !handled.has(name))
+    .map(([name, p]) => [`${name}.error`, { in: [`${name}:error`], out: [to], macro: p.macro, made: true }]);
+  return { ...net, transitions: { ...net.transitions, ...Object.fromEntries(made) } };
 }
 
 /** Arcs of the drawn transitions; those that end in one macro place alike are one, with their weights summed. */
@@ -52,7 +64,8 @@ function transitionOf(data, name, t, error, outside) {
   const when = { events: listed(t.event).map((e) => ({ name: e, scope: scopeOf(events[e]) })), when: t.when ?? "", after: t.after };
   // the automatic layout puts an element outside next to the opened macro place
   const where = outside ? { x: undefined, y: undefined, outside } : { x: t.x, y: t.y };
-  return { name, label: t.label ?? "", error, hint: name, ...where, ...when };
+  const hint = t.made ? `${name}\nmade by the table errors` : name;
+  return { name, label: t.label ?? "", error, made: Boolean(t.made), hint, ...where, ...when };
 }
 
 /** Tokens at the start in a place; a macro place has those of all within it. */

@@ -21,11 +21,18 @@ export class Findings {
     return this.list.filter((f) => f.severity === "error").length;
   }
 
-  /** The server's answer for a text: its findings, and the text itself. */
+  /** The server's answer for a text: its findings, and the text itself. Some findings come only with the analysis. */
   take({ findings, text }) {
-    Object.assign(this, { list: findings, text });
+    Object.assign(this, { list: findings, text, searched: false });
     attribute(this.root, "aria-busy", null);
     this.paint();
+  }
+
+  /** The findings of the analysis, which replace those of the check. */
+  takeAll(list) {
+    Object.assign(this, { list, searched: true });
+    this.paint();
+    this.designer.inspector.show(this.designer.selection);
   }
 
   /** Ask when the drawing has not changed for a moment; until the answer the list shows the earlier findings. */
@@ -92,7 +99,7 @@ export class Findings {
     if (this.press.holds(() => this.paintList())) return;
     const { errors } = this;
     const list = [...this.list].sort((a, b) => (ORDER[a.severity] ?? 2) - (ORDER[b.severity] ?? 2));
-    fill(this.root, h("h2", {}, icon(errors ? "error" : "check"), errors ? `${errors} ${errors === 1 ? "fault" : "faults"}` : "May run", h("span", { class: "muted" }, list.length > errors ? `${list.length - errors} to look at` : "")),
+    fill(this.root, h("h2", {}, icon(errors ? "error" : "check"), errors ? `${errors} ${errors === 1 ? "fault" : "faults"}` : "May run", h("span", { class: "muted" }, [list.length > errors ? `${list.length - errors} to look at` : "", errors || this.searched ? "" : "states not searched yet"].filter(Boolean).join("; "))),
       h("ul", {}, list.map((f) => h("li", { class: f.severity }, h("button", { type: "button", onclick: () => this.goTo(f) }, icon(SIGN[f.severity] ?? "info"), h("strong", {}, words(this.elementOf(f) || f.key)), h("span", {}, f.text, f.remedy ? `. ${f.remedy.replace(/^./, (c) => c.toUpperCase())}.` : ""))))));
     attribute(this.root, "data-state", errors ? "error" : "ok");
   }

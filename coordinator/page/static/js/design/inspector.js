@@ -7,6 +7,7 @@ import { align, distribute, layOut } from "./arrange.js";
 import { events, variables } from "./declared.js";
 import { actionsOf, scopeOf, taskOf } from "./drawn.js";
 import { around, groups, within } from "./macros.js";
+import { MADE } from "./model.js";
 import { readValue, writeValue } from "./values.js";
 
 const KINDS = ["plain", "action", "resource", "control", "macro"];
@@ -43,7 +44,9 @@ export class Inspector {
     this.later = 0;
     const { selection } = this.designer;
     const [name] = selection.names;
-    if (selection.arc) fill(this.root, this.arc(selection.arc));
+    const chosen = selection.arc?.transition ?? (selection.names.size === 1 ? name : null);
+    if (chosen && !this.model.has(chosen)) fill(this.root, [this.head("Transition", chosen), h("p", { class: "muted" }, MADE)]);
+    else if (selection.arc) fill(this.root, this.arc(selection.arc));
     else if (selection.names.size > 1) fill(this.root, this.several(selection.names));
     else if (name && this.model.place(name)) fill(this.root, this.place(name, this.model.place(name)));
     else if (name && this.model.transition(name)) fill(this.root, this.transition(name, this.model.transition(name)));
@@ -132,7 +135,7 @@ export class Inspector {
       return nodes.length ? `${words(p)} (on ${nodes.join(", ")})` : words(p);
     };
     const options = [["", "choose …"], ...[...known].sort().map((p) => [p, label(p)])];
-    const exits = new Set(this.designer.picture.arcs.filter((a) => a.direction === "in" && a.place === name).map((a) => a.end));
+    const exits = new Set(this.designer.picture.arcs.filter((a) => a.direction === "in" && a.place === name && this.model.has(a.transition)).map((a) => a.end));
     const add = (end, text) => (exits.has(end) ? null : h("button", { type: "button", class: "small", onclick: () => this.designer.tools.addExit(name, end) }, icon("plus"), text));
     const task = taskOf(name, place);
     const primitive = data.primitive_tasks?.[task];
@@ -291,10 +294,22 @@ export class Inspector {
       this.field("Goal", this.input(task?.goal, (v) => set("goal", v), { placeholder: "when a run of the task counts as good" })),
       this.field("Ends when", this.input(task?.final, (v) => set("final", v), { placeholder: "runs == 0 and arm_free == 1" }), "a condition on the tokens of places"),
       this.field("Gives up when", this.input(task?.final_error, (v) => set("final_error", v), { placeholder: "never" })),
+      this.errorsTo(),
       this.field("Remaining runs in", this.choice(task?.runs_place, [["", "no place"], ...controls], (v) => set("runs_place", v))),
       events(this), variables(this),
       h("p", { class: "muted" }, "Choose an element to see its properties. Press ? for the keyboard."),
     ];
+  }
+
+  /** Where the error branches go that nobody draws. */
+  errorsTo() {
+    const { model } = this;
+    const places = Object.entries(model.net.places ?? {}).filter(([, p]) => p.kind !== "macro").map(([n]) => [n, words(n)]);
+    const set = (to) => model.edit("change error branches", (_, net) => {
+      if (to) net.errors = { ...net.errors, to };
+      else delete net.errors;
+    });
+    return this.field("Errors without a branch go to", this.choice(model.net.errors?.to, [["", "no place"], ...places], set));
   }
 
   subnet() {
@@ -309,6 +324,7 @@ export class Inspector {
       this.field("Tokens enter", this.choice(model.net.entry, places, (v) => set("entry", v))),
       this.field("Tokens leave after success or failure from", this.choice(model.net.normal, places, (v) => set("normal", v))),
       this.field("Tokens leave after an error from", this.choice(model.net.error, [["", "none"], ...places], (v) => set("error", v))),
+      this.errorsTo(),
     ];
   }
 }

@@ -5,6 +5,8 @@ import { drawn } from "./drawn.js";
 import { around, group, groups, members, own, ungroup, within } from "./macros.js";
 
 const UNDO_KEPT = 300;
+/** What to do about a transition that only the table `errors` makes. */
+export const MADE = "This error branch is made by the table errors of the file. To draw another one, choose its place and press Add error branch.";
 const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
 
 export const emptyDocument = (name) => ({ schema: 1, task: { name, final: "false" }, primitive_tasks: {}, events: {}, places: {}, transitions: {} });
@@ -163,6 +165,7 @@ export class Model {
   /** Draw an arc; returns null, or why it cannot be drawn. */
   connect(from, to, inhibit = false) {
     const [a, b] = [this.place(from), this.place(to)];
+    if (![from, to].every((name) => this.has(name))) return MADE;
     if (from === to) return "An arc connects two different elements.";
     if (a && b) return "An arc connects a place and a transition, never two places. Put a transition between them.";
     if (!a && !b) return "An arc connects a place and a transition, never two transitions. Put a place between them.";

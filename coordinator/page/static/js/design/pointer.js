@@ -2,6 +2,7 @@
 
 import { attribute, s } from "../dom.js";
 import { border, snap } from "../geometry.js";
+import { isMovable } from "./arrange.js";
 
 const NEAR = 7;
 const MOVED = 4;
@@ -99,14 +100,14 @@ export class Pointer {
     const { designer, view } = this;
     const kept = designer.tools.tool;
     let to = name;
-    if (!to) {
+    if (!to && designer.model.has(from)) {
       const [x, y] = view.at(event.clientX, event.clientY);
       const isPlace = Boolean(designer.model.place(from));
       to = isPlace ? designer.model.addTransition(snap(x), snap(y)) : designer.model.addPlace("action", snap(x), snap(y));
     }
     await designer.connect(from, to);
     designer.tools.use(kept);
-    designer.choose(new Set([to]));
+    designer.choose(new Set([to ?? from]));
   }
 
   // ---- elements -----------------------------------------------------------------------------------------------------
@@ -117,7 +118,7 @@ export class Pointer {
     if (!designer.selection.names.has(element.name)) designer.choose(new Set([element.name]));
     view.focusable(element.name);
     const [x0, y0] = view.at(event.clientX, event.clientY);
-    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter((e) => e && !e.outside).map((e) => [e.name, { x: e.x, y: e.y }]));
+    const moved = new Map([...designer.selection.names].map((n) => view.elements.get(n)).filter((e) => e && isMovable(e)).map((e) => [e.name, { x: e.x, y: e.y }]));
     if (!moved.has(element.name)) return designer.choose(new Set([element.name]));
     const others = [...view.elements.values()].filter((e) => !moved.has(e.name) && !view.isFolded(e));
     let going = false;

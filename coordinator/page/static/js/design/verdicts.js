@@ -30,6 +30,7 @@ export class Verdicts {
     this.heatButton.hidden = true;
     attribute(this.heatButton, "aria-pressed", "false");
     this.head.textContent = "";
+    attribute(this.root, "data-state", null);
     fill(this.list);
   }
 
@@ -58,6 +59,7 @@ export class Verdicts {
       this.head.textContent = answer;
       return;
     }
+    this.designer.findings.takeAll(answer.findings);
     const against = answer.verdicts.filter((v) => v.problem).length;
     this.head.textContent = `${against ? `${against} ${against === 1 ? "problem" : "problems"}` : "no problem"} found in ${answer.markings} markings${answer.complete ? "" : " (not all were examined)"}`;
     attribute(this.root, "data-state", against ? "error" : null);
