@@ -504,32 +504,26 @@ class Drawer:
         the contexts tell, for each replicate.
 
         It is the ratio of observed and expected ends, shrunk towards 1 as James and Stein do
-        (1961): the contexts split only where a test is
-        sure, and several choices at once would otherwise be forecast as if none of them mattered.
+        (1961): the contexts split only where a test is sure, and several choices at once would
+        otherwise be forecast as if none of them mattered.
         """
         even = np.ones((1, self._weights.shape[1]))
-        observed, expected, square = {}, {}, 0.0
         leaves = [(leaf.ends, leaf.chosen[earlier]) for leaf in top.leaves()]
         codes, counts = np.unique(
             np.concatenate([ends.outcome[~ends.beyond] for ends, _ in leaves]), return_counts=True
         )
-        frequent = codes[counts >= FEW].tolist()
         actions = np.unique(np.concatenate([chosen for _, chosen in leaves])).tolist()
-        for action in actions:
-            for code in frequent:
-                seen, due = _ends_and_expected(leaves, even, action, code)
-                square += float((seen - due)[0] ** 2 / max(float(due[0]), 1e-9))
-            if action == choice:
-                for code in frequent:
-                    found = _ends_and_expected(leaves, self._weights, action, code)
-                    observed[code], expected[code] = found
-        free = (len(actions) - 1) * (len(frequent) - 1)
-        surely = max(0.0, 1.0 - max(0, free - 2) / square) if square > 0 else 0.0
-        return {
-            code: 1.0
-            + surely * (seen / np.where(expected[code] > 0, expected[code], seen + 1e-9) - 1.0)
-            for code, seen in observed.items()
-        }
+        out = {}
+        for code in codes[counts >= FEW].tolist():
+            square = 0.0
+            for action in actions:
+                seen, due, n = (v[0] for v in _ends_and_expected(leaves, even, action, code))
+                square += float((seen - due) ** 2 / max(due * (1.0 - due / max(n, 1.0)), 1e-9))
+            # of m choices m - 1 are free, and Stein's estimate of m - 1 means takes m - 3
+            surely = max(0.0, 1.0 - max(0, len(actions) - 3) / max(square, 1e-9))
+            seen, due, _ = _ends_and_expected(leaves, self._weights, choice, code)
+            out[code] = 1.0 + surely * (seen / np.where(due > 0.0, due, seen + 1e-9) - 1.0)
+        return out
 
     def _descend(
         self,
@@ -665,17 +659,18 @@ class Drawer:
 
 def _ends_and_expected(
     leaves: Sequence[tuple[EndDistribution, Codes]], weights: Values, choice: int, outcome: int
-) -> tuple[Values, Values]:
-    """Return how many runs after a choice ended with an outcome, and how many would have if the
-    choice did not matter in their contexts, by replicate."""
-    seen = due = np.zeros(len(weights))
+) -> tuple[Values, Values, Values]:
+    """Return how many runs after a choice ended with an outcome, how many would have if the choice
+    did not matter in their contexts, and how many there are, by replicate."""
+    seen = due = runs = np.zeros(len(weights))
     for ends, chosen in leaves:
         each = weights[:, ends.trial] * ~ends.beyond
         whole, so = each.sum(axis=1), ends.outcome == outcome
         own = each[:, chosen == choice].sum(axis=1)
         seen = seen + each[:, so & (chosen == choice)].sum(axis=1)
         due = due + own * each[:, so].sum(axis=1) / np.where(whole > 0, whole, 1.0)
-    return seen, due
+        runs = runs + own
+    return seen, due, runs
 
 
 def _along(ends: EndDistribution, index: Codes, took: Values) -> Values:
