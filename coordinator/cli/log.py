@@ -160,7 +160,8 @@ def _text(found: Recorded) -> Iterator[str]:
     from petrobot.coordinator.run.recording import Remark, TakeOver, with_asides
 
     header = found.journal.header
-    yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
+    how = f"{header['mode']}  {found.plant}  seed {header['seed']}"
+    yield f"{header['mission']}  {header['date']}  {how}"
     if found.journal.torn_bytes:
         yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
     event, again, until = None, 0, ""

@@ -81,9 +81,9 @@ def _snapshot(state: Mapping[str, Any]) -> str:
     known = ", ".join(
         f"{n} = {json_text(v)}" for n, v in state["variables"].items() if "." not in n
     )
-    return (
-        f"{mission['id']}: {how}; controls: {controls['holder'] or 'no operator'}; tokens: {tokens}"
-        + (f"; variables: {known}" if known else "")
+    name = f"{mission['id']} ({mission['plant']})" if mission.get("plant") else mission["id"]
+    return f"{name}: {how}; controls: {controls['holder'] or 'no operator'}; tokens: {tokens}" + (
+        f"; variables: {known}" if known else ""
     )
 
 

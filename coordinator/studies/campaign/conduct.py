@@ -13,7 +13,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
-from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
 from petrobot.coordinator.studies.campaign.block import PLOTS, LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import write_estimates
 from petrobot.coordinator.studies.campaign.plan import (
@@ -37,6 +36,7 @@ from petrobot.coordinator.studies.campaign.table import (
     rows_of,
     sessions,
 )
+from petrobot.services.comm.location_file import MOCK, SIMULATED
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
