@@ -342,3 +342,12 @@ def test_a_scripted_run_is_resumed_with_its_script(
     assert main(["resume", "last", "--up", "--no-page", "--quiet"]) == 0, capsys.readouterr()
     assert not (cell / "moved").exists()
     assert list(EstimatesFile(cell / "a.estimates").read().plants) == ["mock"]
+
+
+def test_a_script_without_nodes_of_its_own_is_refused(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The nodes that are up would move the robot, and the records would say `mock`."""
+    (cell / "script.toml").write_text(SCRIPT)
+    assert main(["run", "go.toml", "--mock", "script.toml"]) == 2
+    assert "--mock replaces actions of nodes that are started here" in capsys.readouterr().err
