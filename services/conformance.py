@@ -14,6 +14,7 @@ import os
 import signal
 import threading
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -128,6 +129,9 @@ def check_driver(
     except _TooLongError as fault:
         check.fault(str(fault))
     except Exception as fault:
+        *_, (where, _) = traceback.walk_tb(fault.__traceback__)
+        if where.f_code.co_filename == __file__:  # no fault of the driver, but a bug here
+            raise
         check.fault(f"the driver raised {type(fault).__name__}: {fault}")
     finally:  # also after Ctrl-C: the device may be moving
         check.end()
@@ -631,12 +635,15 @@ class _Check:
                 self.note(f"{', '.join(obeys)}: let `make` take keys of the device's table")
             return
         positions, took = self.measured
+        if obeys and not positions:
+            self.note(f"{', '.join(obeys)}: no number of the state tells where the device is")
+            return
         if "speed" in obeys:
             asked = SLOW * self.driver.speed  # its table may have a speed
             self.again(f"speed = {asked:g}", speed=asked)
-            most = max(positions, key=positions.__getitem__, default="")
+            most = max(positions, key=positions.__getitem__)
             slow, slowly = self.way(there, back, seconds / SLOW)
-            share = slow.get(most, 0.0) / slowly / (positions.get(most, 0.0) / took or 1.0)
+            share = slow.get(most, 0.0) / slowly / (positions[most] / took)
             if share > SLOWED:
                 self.fault(
                     f"speed = {asked:g}: {dict(there)} moves it at {share:.2f} of its usual speed; "
