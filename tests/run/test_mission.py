@@ -55,7 +55,10 @@ def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureF
 
 def test_a_missed_goal_names_the_verdict_that_cost_it() -> None:
     """Not the error before it, from which the task recovered. A preempted run is a run, too."""
-    tally, cell = MissionTally(0, frozenset({"counted"})), parse(SERVICES, "services.toml")
+    tally, cell = (
+        MissionTally(0, frozenset({"counted"})),
+        parse(SERVICES.replace("ON_RESUME", "rejoin"), Path("services.toml")),
+    )
     for n, verdict in enumerate((Status.SUCCESS, Status.FAILURE), 1):
         tally.instruction(n, Fired(n, "go", (3 - n,), (2 - n,), "Begin", ()))
         for place, status, cause, cancelled in (
