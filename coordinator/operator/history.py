@@ -184,7 +184,9 @@ class _StepDescriber:
                 notes.append(f"{instruction.action} starts in {instruction.place}")
             elif isinstance(instruction, RunRecorded):
                 self._ends[instruction.run] = reason_recorded(instruction)
-                if instruction.cancelled:
+                if instruction.deferred:
+                    text += " (provisional)"
+                elif instruction.cancelled:
                     text = f"{instruction.place} has stopped: {instruction.taken_away}"
             elif isinstance(instruction, Report) and instruction.severity.value != "note":
                 notes.append(instruction.text)
