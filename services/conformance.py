@@ -95,6 +95,7 @@ class DriverCheck:
 def check_driver(
     make: Callable[..., Driver],
     commands: Sequence[Command] = (),
+    keys: Mapping[str, Any] | None = None,
     *,
     first: Sequence[Command] = (),
     seconds: float = 5.0,
@@ -105,7 +106,8 @@ def check_driver(
     progress: Callable[[str], None] = lambda _: None,
 ) -> DriverCheck:
     """Check a driver. `make` is its class, or makes a new one each time; `make(speed=0.25)` adds
-    this key to the device's table, as `lambda **keys: Axis(keys, ports)` does.
+    this key to the device's table, as `lambda **keys: Axis(keys, ports)` does. `keys` are
+    those that the table always has.
 
     `commands` are two or more that move to different positions, each in at most `seconds`,
     preferably in more than `within`; `first` are those that a new driver needs before them, to
@@ -121,6 +123,7 @@ def check_driver(
     clock: Any = _Clock() if simulated else time
     if isinstance(make, type):
         make = partial(_made, make, clock.monotonic)
+    make = partial(make, **keys) if keys else make
     check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions, progress)
     try:
         check.rules(commands, seconds, cable)

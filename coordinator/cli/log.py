@@ -251,7 +251,8 @@ def _cause(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]
             of = f"from {source}" if source else ""
             yield "event", event, ": ".join(filter(None, (of, unserved(step, engine))))
         case RaiseEvent(event):
-            yield "event", event, ": ".join(filter(None, (text, unserved(step, engine))))
+            how = ("raised by the operator", unserved(step, engine))
+            yield "event", event, ": ".join(filter(None, how))
         case RunRaised(run, event):
             yield "event", event, f"raised by {run}"
         case ForceExit(of) | Override(of):

@@ -278,6 +278,8 @@ def test_dry_run_and_normal_programs_refuse_each_other(cell: Path) -> None:
         peers = Peers("pc", mine.hash, False, 1.0)
         refused = peers.refusal("c", Hello(2, 2, "coordinator", "c", "boot", 1, its.hash))
         assert isinstance(refused, Refuse) and "give --dry-run to both" in refused.text
+        assert f"dry run of {usual.hash[:12]})" in refused.text
+        assert f"({usual.hash[:12]})" in refused.text
         asks = Hello(2, 2, "client", "c", "boot", 0, its.hash)  # `petrobot nodes`: who only asks
         assert Peers("pc", mine.hash, False, 1.0).refusal("c", asks) is None
     other = Hello(2, 2, "client", "c", "boot", 0, "another file")

@@ -775,3 +775,17 @@ def test_a_bug_of_the_check_is_not_a_fault_of_the_driver(monkeypatch: pytest.Mon
     monkeypatch.setattr(conformance, "SLOW", 0.0)
     with pytest.raises(ZeroDivisionError):
         check_driver(SpeedyAxis, [{"to": 0.1}, {"to": 0.2}], simulated=True)
+
+
+def test_keys_of_the_table_may_be_given() -> None:
+    """As the location file has them; the tests of `speed` add theirs."""
+
+    class Far(SpeedyAxis):
+        reach: float = key(0.0, "m")
+
+        def setup(self) -> None:
+            made.append((self.reach, self.speed))
+
+    made: list[tuple[float, float]] = []
+    check_driver(Far, [{"to": 0.1}, {"to": 0.2}], {"reach": 2.0}, simulated=True)
+    assert {reach for reach, _ in made} == {2.0} and {speed for _, speed in made} >= {1.0, 0.25}
