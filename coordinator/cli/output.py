@@ -116,6 +116,8 @@ def print_result(result: Mapping[str, Any]) -> None:
             console.print(_table(key, value))
     plain = Table.grid(padding=(0, 2))
     for key, value in result.items():
+        if key == "sim_s" and result.get("mode") == "realtime":
+            continue  # nothing was simulated; --json has it
         if isinstance(value, bool | int | float | str):
             plain.add_row(Text(key, style="dim"), _cell(key, value))
         elif key == LAST_ERRORS:
@@ -123,8 +125,8 @@ def print_result(result: Mapping[str, Any]) -> None:
                 plain.add_row(Text("error", style="dim"), Text(_error(row), style=COLOURS["error"]))
         elif key == MISSED:
             for row in value:
-                told = f"{row['goals']} goal{'s' * (row['goals'] != 1)}: {_error(row)}"
-                plain.add_row(Text("missed", style="dim"), Text(told, style=COLOURS["failure"]))
+                line = f"{row['goals']} goal{'s' * (row['goals'] != 1)}: {_error(row)}"
+                plain.add_row(Text("missed", style="dim"), Text(line, style=COLOURS["failure"]))
         elif key == LAST_FAILURE:
             told = Text(_error(value), style=COLOURS["failure"])
             plain.add_row(Text("failure", style="dim"), told)
