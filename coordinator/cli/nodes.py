@@ -123,6 +123,8 @@ def _print(answers: dict[str, Any]) -> None:
             state += "\n[red]stopped[/]"
         if answer.get("status", {}).get("dry_run"):
             state += "\n[yellow]dry run[/]"
+        if answer.get("status", {}).get("scripted"):
+            state += "\n[yellow]scripted[/]"
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)

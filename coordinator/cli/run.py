@@ -265,10 +265,6 @@ def run(options: argparse.Namespace) -> int:
         refuse_idle(
             options, "only for --mode lockstep; in real time, nodes are joined", idle={"processes"}
         )
-        if options.mock is not None and not options.up:  # nodes that are up would move the robot
-            raise CommandError(
-                2, "--mock replaces actions of nodes that are started here: add --up"
-            )
     task = load_task(options.task)
     directory = load_directory(cell_path(options.services, options.task, task), options.dry_run)
     if options.join and (not lockstep or options.processes != 0):

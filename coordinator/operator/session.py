@@ -295,6 +295,7 @@ class RealtimeSession(RunSession):
 
     async def connect(self) -> None:
         await self.shell.connect()
+        await self.shell.refuse_others(self.plant)
         directory = self.mission.executor.directory
         tasks = self._task.primitive_tasks.values()
         actions = (directory.actions.get(name) for task in tasks for name in task.alternatives)

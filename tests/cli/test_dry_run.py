@@ -4,6 +4,8 @@ sent to the device."""
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -24,6 +26,7 @@ from petrobot.services.device import LIMITS, can_move, keys_of
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.ports import ProcessPorts
 from tests.ports import free_ports
+from tests.waiting import Limit
 
 ROOT = Path(__file__).parents[2]
 ROBOT = '''
@@ -346,10 +349,27 @@ def test_a_scripted_run_is_resumed_with_its_script(
     assert list(EstimatesFile(cell / "a.estimates").read().plants) == ["mock"]
 
 
-def test_a_script_without_nodes_of_its_own_is_refused(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("scripted", [False, True])
+@pytest.mark.processes
+def test_scripted_and_other_programs_refuse_each_other(
+    cell: Path, scripted: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The nodes that are up would move the robot, and the records would say `mock`."""
+    """Nodes that are up would move the robot of a scripted run, or teach a real one the script."""
     (cell / "script.toml").write_text(SCRIPT)
-    assert main(["run", "go.toml", "--mock", "script.toml"]) == 2
-    assert "--mock replaces actions of nodes that are started here" in capsys.readouterr().err
+    node, run = (["--mock", "script.toml"], []) if scripted else ([], ["--mock", "script.toml"])
+    command = ("petrobot.services", "pc", "--services", "services.toml", *node)
+    with subprocess.Popen([sys.executable, "-m", *command]) as process:
+        try:
+            limit = Limit("the node answers")
+            while main(["nodes"]) and limit.left():
+                time.sleep(0.05)
+            assert ("scripted" in capsys.readouterr().out) is scripted
+            assert main(["run", "go.toml", "--no-page", "--quiet", *run]) == 2
+            how = "with a script" if scripted else "without a script"
+            assert f"node pc was started {how} (--mock)" in capsys.readouterr().err
+            assert not (cell / "moved").exists() and not list((cell / "runs").glob("go*"))
+            assert main(["run", "go.toml", "--no-page", "--quiet", *node]) == 0
+            assert ("mock" if scripted else "real") in capsys.readouterr().out
+        finally:
+            process.terminate()
+            process.wait(10.0)
