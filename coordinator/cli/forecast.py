@@ -23,7 +23,6 @@ from petrobot.coordinator.cli.options import pairs, refuse_idle
 from petrobot.services.comm.location_file import (
     FIRST_PHYSICS,
     MOCK,
-    SIMULATED,
     physics_of,
     same_physics,
 )
@@ -256,7 +255,7 @@ def _trainings(
             },
         )
     plan = read_manifest(path)
-    own = MOCK if plan.mock else SIMULATED
+    own = plan.plant
     if plant not in (None, own):
         raise CommandError(2, f"{path}: --plant {plant}: the campaign's runs are {own}")
     _refuse_other_task(task, plan, path)

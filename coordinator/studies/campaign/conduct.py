@@ -36,7 +36,6 @@ from petrobot.coordinator.studies.campaign.table import (
     rows_of,
     sessions,
 )
-from petrobot.services.comm.location_file import MOCK, SIMULATED
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -156,7 +155,7 @@ class Campaign:
             name,
             summary.asked(),
             self.plan.physics,
-            MOCK if self.plan.mock else SIMULATED,
+            self.plan.plant,
         )
         return result_of(self.folder, self.plan, summary, self.policy.state())
 
