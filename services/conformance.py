@@ -14,6 +14,7 @@ import os
 import signal
 import threading
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -94,6 +95,7 @@ class DriverCheck:
 def check_driver(
     make: Callable[..., Driver],
     commands: Sequence[Command] = (),
+    keys: Mapping[str, Any] | None = None,
     *,
     first: Sequence[Command] = (),
     seconds: float = 5.0,
@@ -104,7 +106,8 @@ def check_driver(
     progress: Callable[[str], None] = lambda _: None,
 ) -> DriverCheck:
     """Check a driver. `make` is its class, or makes a new one each time; `make(speed=0.25)` adds
-    this key to the device's table, as `lambda **keys: Axis(keys, ports)` does.
+    this key to the device's table, as `lambda **keys: Axis(keys, ports)` does. `keys` are
+    those that the table always has.
 
     `commands` are two or more that move to different positions, each in at most `seconds`,
     preferably in more than `within`; `first` are those that a new driver needs before them, to
@@ -120,6 +123,7 @@ def check_driver(
     clock: Any = _Clock() if simulated else time
     if isinstance(make, type):
         make = partial(_made, make, clock.monotonic)
+    make = partial(make, **keys) if keys else make
     check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions, progress)
     try:
         check.rules(commands, seconds, cable)
@@ -128,6 +132,9 @@ def check_driver(
     except _TooLongError as fault:
         check.fault(str(fault))
     except Exception as fault:
+        *_, (where, _) = traceback.walk_tb(fault.__traceback__)
+        if where.f_code.co_filename == __file__:  # no fault of the driver, but a bug here
+            raise
         check.fault(f"the driver raised {type(fault).__name__}: {fault}")
     finally:  # also after Ctrl-C: the device may be moving
         check.end()
@@ -631,12 +638,15 @@ class _Check:
                 self.note(f"{', '.join(obeys)}: let `make` take keys of the device's table")
             return
         positions, took = self.measured
+        if obeys and not positions:
+            self.note(f"{', '.join(obeys)}: no number of the state tells where the device is")
+            return
         if "speed" in obeys:
             asked = SLOW * self.driver.speed  # its table may have a speed
             self.again(f"speed = {asked:g}", speed=asked)
-            most = max(positions, key=positions.__getitem__, default="")
+            most = max(positions, key=positions.__getitem__)
             slow, slowly = self.way(there, back, seconds / SLOW)
-            share = slow.get(most, 0.0) / slowly / (positions.get(most, 0.0) / took or 1.0)
+            share = slow.get(most, 0.0) / slowly / (positions[most] / took)
             if share > SLOWED:
                 self.fault(
                     f"speed = {asked:g}: {dict(there)} moves it at {share:.2f} of its usual speed; "

@@ -401,7 +401,7 @@ def text_of(result: dict[str, Any]) -> str:
     """Return the result as text for the terminal."""
     lines = [
         f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed "
-        f"{result['seed']}"
+        f"{result['seed']}" + (f", {result['plant']}" if "plant" in result else "")
     ]
     if missing := result.get("not_begun"):  # absent in older results
         lines.append(f"  {missing} more never began: their mission run was given up before")

@@ -20,7 +20,12 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
-from petrobot.services.comm.location_file import FIRST_PHYSICS, physics_of, same_physics
+from petrobot.services.comm.location_file import (
+    FIRST_PHYSICS,
+    MOCK,
+    physics_of,
+    same_physics,
+)
 from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -227,7 +232,6 @@ def _trainings(
     """Training trials by regime in a cell, the estimates, and what the forecast says about where
     they come from."""
     from petrobot.coordinator.analysis.may_run import devices_of
-    from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import TASK_COPY, digest, read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table
@@ -251,7 +255,7 @@ def _trainings(
             },
         )
     plan = read_manifest(path)
-    own = MOCK if plan.mock else SIMULATED
+    own = plan.plant
     if plant not in (None, own):
         raise CommandError(2, f"{path}: --plant {plant}: the campaign's runs are {own}")
     _refuse_other_task(task, plan, path)
@@ -330,7 +334,6 @@ def _request(
     regime: str,
     options: argparse.Namespace,
 ) -> Request:
-    from petrobot.coordinator.learning.estimates_file import MOCK
     from petrobot.coordinator.studies.campaign.policies import learned_choices
     from petrobot.coordinator.studies.forecast.choices import choices_of
     from petrobot.coordinator.studies.forecast.predict import Request

@@ -214,8 +214,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--plant",
         metavar="NAME",
-        help="show, task, reset: runs of this plant: real, simulated or mock (default: the first "
-        "of these that the file has, of which none is pooled with another; reset: all)",
+        help="show, task, reset: runs of this plant: real, simulated, dry-run or mock (default: "
+        "the first of these that the file has, of which none is pooled with another; reset: all)",
     )
     parser.add_argument(
         "--cost",

@@ -160,7 +160,8 @@ def _text(found: Recorded) -> Iterator[str]:
     from petrobot.coordinator.run.recording import Remark, TakeOver, with_asides
 
     header = found.journal.header
-    yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
+    how = f"{header['mode']}  {found.plant}  seed {header['seed']}"
+    yield f"{header['mission']}  {header['date']}  {how}"
     if found.journal.torn_bytes:
         yield f"(a torn tail of {found.journal.torn_bytes} bytes was dropped)"
     event, again, until = None, 0, ""
@@ -250,7 +251,8 @@ def _cause(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]
             of = f"from {source}" if source else ""
             yield "event", event, ": ".join(filter(None, (of, unserved(step, engine))))
         case RaiseEvent(event):
-            yield "event", event, ": ".join(filter(None, (text, unserved(step, engine))))
+            how = ("raised by the operator", unserved(step, engine))
+            yield "event", event, ": ".join(filter(None, how))
         case RunRaised(run, event):
             yield "event", event, f"raised by {run}"
         case ForceExit(of) | Override(of):

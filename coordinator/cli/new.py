@@ -411,7 +411,16 @@ def _action(name: str, folder: Path) -> tuple[dict[Path, str], str]:
 
 def _task(name: str, folder: Path) -> tuple[dict[Path, str], str]:
     files = {folder / f"{name}.toml": TASK, folder / f"test_{name}.py": TASK_TEST}
-    hint = f"draw it: petrobot show {folder / name}.toml --errors --out {name}.svg"
+    stand_in = "petrobot.services.action:success"  # it does nothing, and succeeds
+    lines = [f'  {a} = {{ run = "{stand_in}", node = "..." }}' for a in ("work", "recover")]
+    hint = "\n".join(
+        (
+            f"draw it: petrobot show {folder / name}.toml --errors --out {name}.svg",
+            "to check and run it, place its actions in services.toml, under [actions]; these do",
+            "nothing until you write your own (petrobot new action):",
+            *lines,
+        )
+    )
     return {path: _filled(text, name) for path, text in files.items()}, hint
 
 

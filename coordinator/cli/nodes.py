@@ -95,7 +95,7 @@ def _print(answers: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table()
+    table = Table(show_lines=True)
     certified = any("certificate_ends" in answer for answer in answers.values())
     for column in (
         "node",
@@ -105,7 +105,7 @@ def _print(answers: dict[str, Any]) -> None:
         "offers",
         "devices",
     ):
-        table.add_column(column)
+        table.add_column(column, overflow="fold")
     for node, answer in answers.items():
         troubles = answer.get("not_ready", {})
         state = (
@@ -119,11 +119,17 @@ def _print(answers: dict[str, Any]) -> None:
         )
         shown = _devices(answer.get("status", {}), answer.get("stopped", []), troubles)
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
+        if answer.get("stopped"):
+            state += "\n[red]stopped[/]"
         if answer.get("status", {}).get("dry_run"):
-            state += " [yellow]dry run[/]"
+            state += "\n[yellow]dry run[/]"
+        if answer.get("status", {}).get("scripted"):
+            state += "\n[yellow]scripted[/]"
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
+    if any(answer.get("stopped") for answer in answers.values()):
+        print("stopped: when the cell is safe, give `petrobot estop --clear`")
 
 
 def _devices(status: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
@@ -137,7 +143,7 @@ def _devices(status: Mapping[str, Any], stopped: Sequence[str], troubles: Mappin
     for device in dict.fromkeys((*devices, *troubles, *stopped, *dropped)):
         said, told = [device], devices.get(device, {})
         if device in stopped:
-            said.append("[red]stopped (petrobot estop --clear)[/]")
+            said.append("[red]stopped[/]")
         elif device in troubles:
             # the text may come from a driver, with brackets that rich would read as markup
             said.append(f"[yellow]{escape(troubles[device])}[/]")
@@ -151,8 +157,8 @@ def _devices(status: Mapping[str, Any], stopped: Sequence[str], troubles: Mappin
             said.append(f"[yellow]{told['overruns']} cycles missed, at most {late:.0f} ms late[/]")
         if dropped.get(device):
             said.append(f"[yellow]{dropped[device]} events dropped[/]")
-        shown.append(" ".join(said))
-    return ", ".join(shown)
+        shown.append(f"{said[0]} {', '.join(said[1:])}".rstrip())
+    return "\n".join(shown)
 
 
 def _ends(ends: str) -> str:

@@ -33,9 +33,8 @@ NOTE = 60.0
 LONGEST_TABLE = 24
 WIDEST_TABLE = 9
 """Most columns of a table in the terminal; --json and the report show wider ones."""
-LAST_ERRORS, LAST_FAILURE = "last_errors", "last_failure"
-"""Key of the actions that ended in ERROR in a result (`Mission.result`). They are printed as lines,
-not as a table."""
+LAST_ERRORS, LAST_FAILURE, MISSED = "last_errors", "last_failure", "missed_goals"
+"""Keys of runs in a result (`Mission.result`). They are printed as lines, not as a table."""
 
 
 @contextmanager
@@ -108,7 +107,7 @@ def print_result(result: Mapping[str, Any]) -> None:
     console = Console()
     for key, value in result.items():
         if (
-            key != LAST_ERRORS
+            key not in (LAST_ERRORS, MISSED)
             and isinstance(value, list)
             and value
             and all(isinstance(row, Mapping) for row in value)
@@ -117,11 +116,17 @@ def print_result(result: Mapping[str, Any]) -> None:
             console.print(_table(key, value))
     plain = Table.grid(padding=(0, 2))
     for key, value in result.items():
+        if key == "sim_s" and result.get("mode") == "realtime":
+            continue  # nothing was simulated; --json has it
         if isinstance(value, bool | int | float | str):
             plain.add_row(Text(key, style="dim"), _cell(key, value))
         elif key == LAST_ERRORS:
             for row in value:
                 plain.add_row(Text("error", style="dim"), Text(_error(row), style=COLOURS["error"]))
+        elif key == MISSED:
+            for row in value:
+                line = f"{row['goals']} goal{'s' * (row['goals'] != 1)}: {_error(row)}"
+                plain.add_row(Text("missed", style="dim"), Text(line, style=COLOURS["failure"]))
         elif key == LAST_FAILURE:
             told = Text(_error(value), style=COLOURS["failure"])
             plain.add_row(Text("failure", style="dim"), told)

@@ -80,7 +80,9 @@ def run(options: argparse.Namespace) -> int:
             page, pictures, target = _run(options.subject)
     except CampaignError as fault:
         raise CommandError(2, str(fault)) from fault
-    _write(options.out or target, page, pictures, quiet=options.json == "-")
+    out = options.out or target
+    out = out if out.suffix else out.with_suffix(".html")
+    _write(out, page, pictures, quiet=options.json == "-")
     return 0
 
 
@@ -215,9 +217,8 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
     sections = {
         heading: [svg for own, svg in measured.values() if own == heading] for heading in headings
     }
-    page = report_html(
-        {**result, "mission": found.journal.header["mission"]}, timeline, net, drawn, sections
-    )
+    told = {**result, "plant": found.plant, "mission": found.journal.header["mission"]}
+    page = report_html(told, timeline, net, drawn, sections)
     own = {
         f"own_{i}": svg
         for i, svg in enumerate([*own_pictures(result).values(), *drawn.values()], 1)

@@ -66,6 +66,8 @@ def run(options: argparse.Namespace) -> int:
 
     directory, changed = located(found.directory)
     found = replace(found, directory=directory)
+    if mock := found.journal.header.get("mock"):  # the nodes of --up run the same script
+        options.mock = Path(mock)
     if mode == "realtime":
         refuse_stopped(directory)
         if changed:

@@ -81,9 +81,9 @@ def _snapshot(state: Mapping[str, Any]) -> str:
     known = ", ".join(
         f"{n} = {json_text(v)}" for n, v in state["variables"].items() if "." not in n
     )
-    return (
-        f"{mission['id']}: {how}; controls: {controls['holder'] or 'no operator'}; tokens: {tokens}"
-        + (f"; variables: {known}" if known else "")
+    name = f"{mission['id']} ({mission['plant']})" if mission.get("plant") else mission["id"]
+    return f"{name}: {how}; controls: {controls['holder'] or 'no operator'}; tokens: {tokens}" + (
+        f"; variables: {known}" if known else ""
     )
 
 
@@ -95,9 +95,20 @@ def _line(change: Mapping[str, Any]) -> str:
 
 
 def _ended(change: Mapping[str, Any]) -> str:
+    status = "provisional " * change.get("deferred", False) + str(change["status"]).upper()
+    status = "-" if status == "NONE" else status  # as in `petrobot log`
+    return f"ended    {change['id']}  {status}{_why(change)}"
+
+
+def _judged(change: Mapping[str, Any]) -> str:
+    status = f"{str(change['status']).upper()}, was {str(change['was']).upper()}"
+    return f"judged   {change['id']}  {status}{_why(change)}"
+
+
+def _why(change: Mapping[str, Any]) -> str:
     reason = change.get("reason") or {}
-    why = f"  {reason.get('code')}: {reason.get('text')}" if reason.get("code") else ""
-    return f"ended    {change['id']}  {str(change['status']).upper()}{why}"
+    why = ": ".join(filter(None, (reason.get("code"), reason.get("text"))))
+    return f"  {why}" if why else ""
 
 
 def _paused(change: Mapping[str, Any]) -> str:
@@ -121,6 +132,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         f"started  {c['run']['id']}  {c['run']['action']} on {c['run']['node'] or 'no node'}"
     ),
     "run_ended": _ended,
+    "run_judged": _judged,
     # `PLACE.status` and the like are in the line about the run's end.
     "variable": lambda c: (
         "" if "." in c["name"] else f"variable {c['name']} = {json_text(c['value'])}"

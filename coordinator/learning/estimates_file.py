@@ -60,7 +60,14 @@ from petrobot.coordinator.learning.estimates_tables import (
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
-from petrobot.services.comm.location_file import FIRST_PHYSICS, same_physics
+from petrobot.services.comm.location_file import (
+    DRY_RUN,
+    FIRST_PHYSICS,
+    MOCK,
+    REAL,
+    SIMULATED,
+    same_physics,
+)
 from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
@@ -76,9 +83,6 @@ UNWRITABLE = {
 the file of its shared memory cannot grow."""
 PHYSICS = "physics"
 """Row of the table `about`."""
-MOCK, SIMULATED, REAL = "mock", "simulated", "real"
-"""Plants: scripted actions, a simulated laboratory, a real cell (`real NAME` if the location file
-names its installation). "": a file that is older than this does not say."""
 MACHINE_ID = Path("/etc/machine-id")
 """Distinguishes machines (machine-id(5)). Without it, only the inode of the file tells copies
 apart."""
@@ -117,7 +121,7 @@ class FileContents:
 
     def rank(self, plant: str) -> tuple[int, int]:
         """Sort key of plants: the one that matters most first."""
-        kinds = (REAL, SIMULATED, "", MOCK)
+        kinds = (REAL, SIMULATED, "", DRY_RUN, MOCK)
         runs = sum(t.runs + t.censored for t in self.plants[plant].tallies.values())
         return kinds.index(plant.partition(" ")[0]), -runs
 
@@ -513,7 +517,7 @@ def said(plant: str) -> str:
 
 def has_physics(plant: str) -> bool:
     """Return whether runs of a plant depend on the physics of the simulated laboratory."""
-    return plant != MOCK and plant.partition(" ")[0] != REAL
+    return plant.partition(" ")[0] not in (MOCK, DRY_RUN, REAL)
 
 
 def _simulated(db: sqlite3.Connection) -> bool:

@@ -10,9 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.coordinator.learning.estimates_file import (
-    MOCK,
-    REAL,
-    SIMULATED,
     EstimatesError,
     EstimatesFile,
     FileContents,
@@ -24,23 +21,12 @@ from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction, RunEnd
 from petrobot.coordinator.learning.selectors import ACTION, DEFAULT, RULES, credited
 from petrobot.coordinator.task import Task
-from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import DRY_RUN, MOCK
 
 PRIOR_TRIALS = 10.0
 """Trials for which a prior counts unless the user says otherwise. The error of a simulator is not
 known beforehand. If its R of an action has an error of 0.1 (standard deviation), it is worth
 0.9 * 0.1 / 0.1^2 = 9 real runs of an action with R = 0.9, and 25 of one with R = 0.5."""
-
-
-def plant_of(directory: Directory, *, scripted: bool, lockstep: bool) -> str:
-    """Return where runs take place: in scripted actions (`mock`), in a simulated laboratory (also
-    in lock step, whose time is simulated), or in a real cell, with the name of its installation if
-    the location file gives one."""
-    if scripted:
-        return MOCK
-    if lockstep or directory.laboratory():
-        return SIMULATED
-    return f"{REAL} {directory.installation}".strip()
 
 
 @dataclass(frozen=True)
@@ -66,8 +52,8 @@ class LearningSetting:
     credit: str = ACTION
     """What judges a choice: the end of its own run ("action"), or the task's goal ("task")."""
     plant: str = ""
-    """Where the run takes place (`plant_of`): what it learns is never pooled with another plant's;
-    empty: a run that was recorded before this was."""
+    """Where the run takes place (`Directory.plant`): what it learns is never pooled with that of
+    another plant; empty: a run that was recorded before this was."""
     prior: float | None = None
     """Learners start from what is known of another plant (for a real one: the simulated one), as
     from so many trials of each action; None: from nothing."""
@@ -239,7 +225,8 @@ def _prior(setting: LearningSetting, kept: FileContents) -> str | None:
         raise EstimatesError(
             "--prior needs --credit action: estimates hold no verdicts of the task; leave one out"
         )
-    others = [p for p in kept.plants if p not in (setting.plant, MOCK) and kept.plants[p].tallies]
+    useless = (setting.plant, DRY_RUN, MOCK)
+    others = [p for p in kept.plants if p not in useless and kept.plants[p].tallies]
     if not others and not setting.frozen:
         raise EstimatesError(
             f"{setting.path}: --prior needs runs of another plant than {said(setting.plant)} in "

@@ -59,12 +59,12 @@ def _append(state: State, key: str, entry: Any, kept: int) -> None:
 def _ended(state: State, change: Change) -> None:
     run = state["runs"].pop(change["id"], None)
     if run is not None:
-        extra = {key: change[key] for key in ("status", "ended", "reason") if key in change}
+        extra = {key: change[key] for key in _OF_AN_END if key in change}
         _append(state, "ended", {**run, **extra}, ENDED_KEPT)
 
 
 def _judged(state: State, change: Change) -> None:
-    said = {key: change[key] for key in ("status", "reason") if key in change}
+    said = {key: change[key] for key in ("status", "reason") if key in change} | {"deferred": False}
     state["ended"] = [
         {**run, **said} if run["id"] == change["id"] else run for run in state["ended"]
     ]
@@ -100,6 +100,7 @@ def _whole(state: State, change: Change) -> None:
 
 _OF_A_RUN = ("progress", "state", "data", "held_since", "held_for")
 """What a `run_progress` may change."""
+_OF_AN_END = ("status", "ended", "reason", "deferred")
 _TABLES: Mapping[str, str] = {
     "node": "nodes",
     "event": "events",

@@ -64,8 +64,9 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
                 if reason
                 else f"{alternative} chosen"
             )
-        case Verdict(run, status):
-            return f"verdict on {place_of(run)}: {status.value}"
+        case Verdict(run, status, code, text):
+            why = ": ".join(filter(None, (code, text)))
+            return f"verdict on {run}: {status.value}{f' ({why})' if why else ''}"
         case EventOccurred(event):
             return f"event {event}"
         case RunRaised(run, event):

@@ -25,6 +25,7 @@ from petrobot.coordinator.run.recording import (
 )
 from petrobot.coordinator.task import End, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
+from petrobot.services.comm.location_file import Directory
 
 RECORDS_AT_MOST = 20_000
 RUNS_AT_MOST = 300
@@ -75,7 +76,9 @@ def opened(path: Path, run: str) -> dict[str, Any]:
         task = task_of(journal)
     except (JournalError, TaskFileError, KeyError) as fault:
         return {"id": run, "fault": f"{fault}", "task": None, "initial": {}, "records": []}
-    engine = Engine(task, journal.header.get("devices") or _devices(journal))
+    header = journal.header
+    devices, plant = _cell(header)
+    engine = Engine(task, header.get("devices") or devices)
     teller = _StepDescriber(engine)
     records: list[dict[str, Any]] = []
     fault_text = (
@@ -91,11 +94,11 @@ def opened(path: Path, run: str) -> dict[str, Any]:
                 break
     except (JournalError, ReplayError) as fault:
         fault_text = str(fault)
-    header = journal.header
     return {
         "id": run,
         "fault": fault_text,
         "mode": header.get("mode", ""),
+        "plant": plant,
         "seed": header.get("seed"),
         "started": header.get("date", ""),
         "from": _source(header),
@@ -134,15 +137,23 @@ def task_of(journal: Journal) -> Task:
     return with_runs(task, runs)[0] if runs is not None else task
 
 
-def _devices(journal: Journal) -> dict[str, str]:
+def _cell(header: Mapping[str, Any]) -> tuple[dict[str, str], str]:
+    """Return the device of each action, and the plant in which the run took place."""
     from petrobot.coordinator.run.folder import still_there
     from petrobot.services.comm.location_file import parse
 
-    text = journal.header.get("services")
+    text = header.get("services")
     if not text:
-        return {}
-    directory = parse(text, still_there(Path(journal.header.get("services_path", "services.toml"))))
-    return {a.name: a.device for a in directory.actions.values() if a.device}
+        return {}, ""
+    directory = parse(text, still_there(Path(header.get("services_path", "services.toml"))))
+    devices = {a.name: a.device for a in directory.actions.values() if a.device}
+    return devices, plant_of(header, directory)
+
+
+def plant_of(header: Mapping[str, Any], directory: Directory) -> str:
+    """Return where a recorded run took place."""
+    scripted, lockstep = bool(header.get("mock")), header.get("mode") == "lockstep"
+    return directory.plant(scripted=scripted, lockstep=lockstep)
 
 
 class _StepDescriber:
@@ -173,7 +184,9 @@ class _StepDescriber:
                 notes.append(f"{instruction.action} starts in {instruction.place}")
             elif isinstance(instruction, RunRecorded):
                 self._ends[instruction.run] = reason_recorded(instruction)
-                if instruction.cancelled:
+                if instruction.deferred:
+                    text += " (provisional)"
+                elif instruction.cancelled:
                     text = f"{instruction.place} has stopped: {instruction.taken_away}"
             elif isinstance(instruction, Report) and instruction.severity.value != "note":
                 notes.append(instruction.text)

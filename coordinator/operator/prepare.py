@@ -31,7 +31,6 @@ from petrobot.coordinator.learning.session import (
     LearningSession,
     LearningSetting,
     fixed_by_user,
-    plant_of,
     session_of,
 )
 from petrobot.coordinator.operator.commands import Shown
@@ -126,16 +125,16 @@ def prepare(
     _refuse_too_many(request.runs, task)
     seed = SEED if request.seed is None else request.seed
     learning = None
-    physics = _physics(directory)
+    physics, lockstep = _physics(directory), request.mode == LOCKSTEP
+    plant = directory.plant(scripted=request.mock is not None, lockstep=lockstep)
     if request.learning is not None:
         declared = {a.name: a.compute_time for a in directory.actions.values()}
-        lockstep = request.mode == LOCKSTEP
         setting = replace(
             request.learning,
             chosen=request.chosen,
             declared=declared if lockstep else None,
             physics=physics,
-            plant=plant_of(directory, scripted=request.mock is not None, lockstep=lockstep),
+            plant=plant,
         )
         try:
             learning = LearningSession(task, setting, seed)
@@ -143,7 +142,7 @@ def prepare(
             raise RequestError(str(fault)) from fault
     selector = FirstAlternative(request.chosen) if learning is None else learning.selector
     more = {} if learning is None else {"learning": learning.beginning()}
-    return _new(
+    made = _new(
         request,
         directory,
         Setting(task, request.parameters, request.runs, seed, selector),
@@ -152,6 +151,8 @@ def prepare(
         learning,
         observers,
     )
+    made.plant = plant
+    return made
 
 
 def _refuse_too_many(runs: int | None, task: Task) -> None:
@@ -194,6 +195,7 @@ def prepare_from(
         None,
         observers,
     )
+    made.plant = found.directory.plant(scripted=mock is not None, lockstep=True)
     made.origin = {"run": point.run, "record": point.record, "going": dict(point.going)}
     return made
 
@@ -205,6 +207,12 @@ def resume(found: Recorded, observers: Sequence[Observer], ordered: float) -> Ru
 
     Raises EstimatesError, RequestError, JournalError, ReplayError, KeyFileError.
     """
+    made = _resumed(found, observers, ordered)
+    made.plant = found.plant
+    return made
+
+
+def _resumed(found: Recorded, observers: Sequence[Observer], ordered: float) -> RunSession:
     then, folder = found.journal.header, found.journal.path.parent
     _refuse_other_physics(found)
     try:

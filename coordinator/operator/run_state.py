@@ -274,12 +274,18 @@ class ChangePublisher:
             ended=round(time, 4),
             reason=reason,
             cancelled=record.cancelled,
+            deferred=record.deferred,
         )
 
     def _corrected(self, time: float, corrected: Corrected) -> None:
         reason = reason_of(corrected.status, corrected.cause, corrected.text, Executed.YES)
         self.feed.emit(
-            "run_judged", time=time, id=corrected.run, status=corrected.status.value, reason=reason
+            "run_judged",
+            time=time,
+            id=corrected.run,
+            status=corrected.status.value,
+            was=corrected.was.value,
+            reason=reason,
         )
 
     def _report(self, time: float, report: Report) -> None:

@@ -88,6 +88,8 @@ class RunSession(ABC):
         self.address: RunAddress | None = None
         """Where the run can be controlled; the address is in the run's folder while the run is
         active."""
+        self.plant = ""
+        """Where it takes place (`Directory.plant`)."""
         self.origin: Mapping[str, Any] = {}
         """The point of a recorded run at which this one started."""
         self._learning = learning
@@ -122,6 +124,7 @@ class RunSession(ABC):
             mode=self.mode,
             shown=self._shown,
         )
+        self.operation.feed.emit("mission", mission={"plant": self.plant})
         return self.operation
 
     @abstractmethod
@@ -192,6 +195,9 @@ class RunSession(ABC):
         later = self._resumed and self.mode == REALTIME
         resumed = {"resumed": "wall_s counts from the last resume"} if later else {}
         return {
+            "task": self._task.name,
+            "mode": self.mode,
+            "plant": self.plant,
             **self.mission.result(self.mode, self._seconds),
             **resumed,
             **self._learned,
@@ -289,6 +295,7 @@ class RealtimeSession(RunSession):
 
     async def connect(self) -> None:
         await self.shell.connect()
+        await self.shell.refuse_others(self.plant)
         directory = self.mission.executor.directory
         tasks = self._task.primitive_tasks.values()
         actions = (directory.actions.get(name) for task in tasks for name in task.alternatives)

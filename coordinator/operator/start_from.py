@@ -27,7 +27,7 @@ from petrobot.coordinator.engine import (
     to_plain,
 )
 from petrobot.coordinator.launch import Setting
-from petrobot.coordinator.operator.history import task_of
+from petrobot.coordinator.operator.history import plant_of, task_of
 from petrobot.coordinator.run.folder import still_there
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
@@ -53,6 +53,11 @@ class Recorded:
     task: Task
     directory: Directory
     engine: Engine
+
+    @property
+    def plant(self) -> str:
+        """Where it took place."""
+        return plant_of(self.journal.header, self.directory)
 
     def steps(self) -> Iterator[RecordedStep]:
         """Replay every stimulus."""

@@ -89,6 +89,8 @@ class Cycle:
     """Firings of goal transitions."""
     errors: int = 0
     """Runs that ended in ERROR and were not cancelled."""
+    last: str = ""
+    """The run of its last end or verdict other than SUCCESS."""
 
     @property
     def lost(self) -> int:
@@ -99,6 +101,11 @@ class Cycle:
         """Add a run, or the verdict on an earlier one."""
         if status is not None:
             self.ends[run] = (status, cause, text)
+            if status is not Status.SUCCESS:
+                self.last = run
+            elif self.last == run:  # a verdict took it away
+                bad = (name for name in reversed(self.ends) if self.ends[name][0] is not status)
+                self.last = next(bad, "")
         if len(self.ends) >= 2 * KEPT:
             old = [self.ends.pop(run) for run in list(self.ends)[:KEPT]]
             self.forgotten = _worst([self.forgotten, *old])
@@ -150,7 +157,8 @@ class MissionTally:
     """Tokens that the operator put into the runs place, less those taken out."""
     firings: int = 0
     ended: int = 0
-    """Runs that ended and were not cancelled."""
+    """Runs that ended, also by preemption."""
+    preempted: int = 0
     failed: Counter[str] = field(default_factory=Counter)
     """Runs that ended in ERROR, by primitive task and cause."""
     examples: dict[str, RunRecorded] = field(default_factory=dict)
@@ -181,7 +189,8 @@ class MissionTally:
             _forget_oldest(self.runs)
             self.runs.append(instruction)
             failed = self._judge(instruction, 1)
-            self.ended += not instruction.cancelled
+            self.ended += 1
+            self.preempted += instruction.cancelled
             if self.cycles:
                 self.cycles[-1].errors += failed
                 self.cycles[-1].count(
@@ -219,12 +228,26 @@ class MissionTally:
             if self.failed[key] > 0  # a verdict may have taken the last error of a cause away
         ]
 
+    def missed(self, directory: Directory) -> list[dict[str, Any]]:
+        """Return for each primitive task and cause the last run that cost a goal, and how many
+        `goals`: the last end or verdict other than SUCCESS of each cycle without a goal. Empty
+        where that is not known: if cycles overlap, or some were forgotten."""
+        lost, found = [cycle for cycle in self.cycles if not cycle.goals], dict[str, Any]()
+        records = {record.run: record for record in self.runs}
+        for cycle in lost if len(lost) == self.begun - self.goals else ():
+            if (record := records.get(cycle.last)) is not None:
+                key = f"{record.primitive_task}: {record.cause}"
+                count = found.pop(key, {}).get("goals", 0) + 1  # a later one goes to the end
+                found[key] = {**_row(record, directory), "goals": count}
+        return list(found.values())
+
     def happened(self, recovered: bool, missed: bool = False) -> str:
         """Return what happened on the way, in words: number of runs, errors by primitive task and
         cause, and values that a result lacked. `recovered`: the task reached its end as designed;
         `missed`: it met fewer goals than it was asked for."""
         failed = +self.failed  # a verdict may have taken the last error of a cause away
-        parts = [_count(self.ended, "run")]
+        cut = f", {self.preempted} of them preempted" if self.preempted else ""
+        parts = [_count(self.ended, "run") + cut]
         if failed:
             causes = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in failed.items())
             told = ", all recovered" if recovered else ""
@@ -398,13 +421,15 @@ class Mission:
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
         """Return the result as the command line writes it; the keys of the score stand beside the
         general ones. `last_errors` says why actions ended in ERROR, also those that the task
-        recovered from. `last_failure` is set if the task ended in ERROR and no action did."""
+        recovered from, and `missed_goals` which ends and verdicts cost goals. `last_failure` is set
+        if the task ended in ERROR and no action did."""
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
         errors = self.tally.last_errors(self.executor.directory)
         failure = self.tally.failure if failed and not errors else None
         has_goal, met = bool(self.tally.goal_transitions), self.tally.goals
         wanted = self.runs + self.tally.added
+        missed = self.tally.missed(self.executor.directory) if has_goal and met < wanted else []
         # A run may meet several goals: "4 of 2" would be no share.
         within = f"of {wanted}" if met <= wanted else f"in {wanted} run{'s' * (wanted != 1)}"
         general = {
@@ -418,6 +443,7 @@ class Mission:
             **({"goals": f"{met} {within}"} if has_goal else {}),
             "happened": self.tally.happened(not failed, has_goal and met < wanted),
             **({"last_errors": errors} if errors else {}),
+            **({"missed_goals": missed} if missed else {}),
             **({"last_failure": _row(failure, self.executor.directory)} if failure else {}),
             **self.remarks,
         }

@@ -18,7 +18,7 @@ from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import KEY_CODES, Client
 from petrobot.services.comm.calls.peers import LEASED, OVERTAKEN
-from petrobot.services.comm.location_file import Directory, sources
+from petrobot.services.comm.location_file import MOCK, Directory, sources
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
     LEASE,
@@ -210,6 +210,23 @@ class RealtimeMission:
         client.caller.command(self.now(), Command(id_, verb, target))
         client.flush()
         return answer
+
+    async def refuse_others(self, plant: str) -> None:
+        """Raise MissionError if a node of a scripted run is not scripted, or one of another run is:
+        the records would name the wrong plant, and a real node would move the robot."""
+        nodes = (node.name for node in self._directory.nodes.values() if not node.sim)
+        asked = {node: self._ask(node, "status") for node in nodes}
+        if asked:
+            await asyncio.wait(asked.values(), timeout=LEAVE)
+        for node, answer in asked.items():
+            told = answer.result().data.get("scripted") if answer.done() else None
+            if told is not None and told is not (plant == MOCK):
+                how = "with" if told else "without"
+                raise MissionError(
+                    f"node {node} was started {how} a script (--mock), and this run counts as "
+                    f"{plant}: give --mock to both, or to none",
+                    bad_input=True,
+                )
 
     def _compare_code(self, node: str, answer: asyncio.Future[Answer]) -> None:
         """Say which modules a node was started with that differ from those here. A node imports

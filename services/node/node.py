@@ -214,6 +214,8 @@ class Node:
         self.directory = directory
         self.name = name
         self.boot = boot
+        self.scripted = False
+        """Whether a script (`--mock`) replaces actions of this node."""
         self.code: Mapping[str, str] = {}
         """Digest of the source of each module that it was started with (`sources`)."""
         services = [s for s in directory.services.values() if s.node == name and s.run]
@@ -515,6 +517,7 @@ class Node:
                 if command.verb == "status":
                     data["emergency"] = list(self.stopped_in_emergency())
                     data["dry_run"] = self.directory.dry_run
+                    data["scripted"] = self.scripted
                     data["code"] = self.code
                     data["events_dropped"] = dict(self.callee.events.dropped)
                 self.callee.answer(now, id_, held and not command.missing, data)

@@ -77,6 +77,7 @@ class NodeShell:
             stream_address=self._stream_address,
             latch=self.latch,
         )
+        self.node.scripted = bool(mock)
         self.node.code = {m: digest for m, (_, digest) in sources(directory, name).items()}
         key, tls = self._credentials.key, self._credentials.server()
         self.server = Server(self.node.callee, on_orders=self._obey, key=key, tls=tls)

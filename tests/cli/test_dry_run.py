@@ -4,6 +4,8 @@ sent to the device."""
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -13,6 +15,9 @@ import pytest
 from petrobot import check_driver, rehearse
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.loading import load_directory
+from petrobot.coordinator.learning.estimates_file import EstimatesFile
+from petrobot.coordinator.operator.history import opened
+from petrobot.coordinator.operator.session import RealtimeSession
 from petrobot.services.adapters.ros2.topics import TopicDriver
 from petrobot.services.comm.calls.peers import Peers
 from petrobot.services.comm.location_file import DirectoryError, dry, load, parse, resolve
@@ -21,6 +26,7 @@ from petrobot.services.device import LIMITS, can_move, keys_of
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.ports import ProcessPorts
 from tests.ports import free_ports
+from tests.waiting import Limit
 
 ROOT = Path(__file__).parents[2]
 ROBOT = '''
@@ -275,7 +281,95 @@ def test_dry_run_and_normal_programs_refuse_each_other(cell: Path) -> None:
         peers = Peers("pc", mine.hash, False, 1.0)
         refused = peers.refusal("c", Hello(2, 2, "coordinator", "c", "boot", 1, its.hash))
         assert isinstance(refused, Refuse) and "give --dry-run to both" in refused.text
+        assert f"dry run of {usual.hash[:12]})" in refused.text
+        assert f"({usual.hash[:12]})" in refused.text
         asks = Hello(2, 2, "client", "c", "boot", 0, its.hash)  # `petrobot nodes`: who only asks
         assert Peers("pc", mine.hash, False, 1.0).refusal("c", asks) is None
     other = Hello(2, 2, "client", "c", "boot", 0, "another file")
     assert Peers("pc", dried.hash, False, 1.0).refusal("c", other) is not None
+
+
+SCRIPT = 'schema = 1\n[[actions.go]]\nstatus = "success"\nseconds = 0.1\n'
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+@pytest.mark.parametrize("plant", ["dry-run", "dry-run of one device", "mock"])
+@pytest.mark.processes
+def test_what_was_not_real_is_never_recorded_as_real(
+    cell: Path, mode: str, plant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither by the estimates file, nor by result, text, log, history and report."""
+    (cell / "script.toml").write_text(SCRIPT)
+    more = {"dry-run": ["--dry-run"], "mock": ["--mock", "script.toml"]}.get(plant, [])
+    if not more:
+        place(cell, keys="dry_run = true")
+    up = ["--up", "--no-page"] if mode == "realtime" else []
+    run = ["run", "go.toml", "--mode", mode, *up, *more, "--quiet", "--journal", "runs"]
+    told = ["--json", "out.json", "--report", "report", "--learn", "a.estimates"]
+    assert main([*run, *told]) == 0, capsys.readouterr()
+    plant = plant.split()[0]
+    assert list(EstimatesFile(cell / "a.estimates").read().plants) == [plant]
+    assert json.loads((cell / "out.json").read_text())["plant"] == plant
+    assert plant in capsys.readouterr().out
+    assert plant in (cell / "report" / "index.html").read_text()
+    [journal] = (cell / "runs").glob("*/run.journal")
+    assert opened(journal, "it")["plant"] == plant
+    assert main(["log", str(journal)]) == 0
+    assert plant in capsys.readouterr().out.splitlines()[0]
+    real = ["run", "go.toml", "--mode", "lockstep", "--quiet", "--learn", "a.estimates"]
+    place(cell)
+    assert main([*real, "--prior", "10"]) == 2  # nor does it teach another plant
+    assert "--prior needs runs of another plant" in capsys.readouterr().err
+
+
+@pytest.mark.processes
+def test_a_campaign_refuses_a_dry_run(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for keys, code in (("dry_run = true", 2), ("", 0)):
+        place(cell, keys=keys)
+        assert main(["campaign", "go.toml", "--runs", "2", "--out", "c", "--quiet"]) == code
+    assert "dry_run: a campaign measures nothing while drives are off" in capsys.readouterr().err
+
+
+@pytest.mark.processes
+def test_a_scripted_run_is_resumed_with_its_script(
+    cell: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`resume --up` must not let the rest of it move the device."""
+    (cell / "script.toml").write_text(SCRIPT)
+    run = ["run", "go.toml", "--up", "--no-page", "--quiet", "--mock", "script.toml"]
+
+    async def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RealtimeSession, "_lead", interrupted)
+        main([*run, "--learn", "a.estimates"])
+    assert main(["resume", "last", "--up", "--no-page", "--quiet"]) == 0, capsys.readouterr()
+    assert not (cell / "moved").exists()
+    assert list(EstimatesFile(cell / "a.estimates").read().plants) == ["mock"]
+
+
+@pytest.mark.parametrize("scripted", [False, True])
+@pytest.mark.processes
+def test_scripted_and_other_programs_refuse_each_other(
+    cell: Path, scripted: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nodes that are up would move the robot of a scripted run, or teach a real one the script."""
+    (cell / "script.toml").write_text(SCRIPT)
+    node, run = (["--mock", "script.toml"], []) if scripted else ([], ["--mock", "script.toml"])
+    command = ("petrobot.services", "pc", "--services", "services.toml", *node)
+    with subprocess.Popen([sys.executable, "-m", *command]) as process:
+        try:
+            limit = Limit("the node answers")
+            while main(["nodes"]) and limit.left():
+                time.sleep(0.05)
+            assert ("scripted" in capsys.readouterr().out) is scripted
+            assert main(["run", "go.toml", "--no-page", "--quiet", *run]) == 2
+            how = "with a script" if scripted else "without a script"
+            assert f"node pc was started {how} (--mock)" in capsys.readouterr().err
+            assert not (cell / "moved").exists() and not list((cell / "runs").glob("go*"))
+            assert main(["run", "go.toml", "--no-page", "--quiet", *node]) == 0
+            assert ("mock" if scripted else "real") in capsys.readouterr().out
+        finally:
+            process.terminate()
+            process.wait(10.0)

@@ -71,7 +71,7 @@ STORY: tuple[tuple[Stimulus, str], ...] = (
     (Override("carry", "push"), "operator  carry                operator chose push for carry"),
     (Chosen("carrying#1", "carry"), "started   carrying#1           carry"),
     (EventOccurred("low", "arm"), "event     low                  from arm: nothing waited for it"),
-    (RaiseEvent("press"), "event     press                event press, raised by the operator: "
+    (RaiseEvent("press"), "event     press                raised by the operator: "
      "kept until a transition takes it"),
     (AddTokens("books", 1), "marked    books                operator put 1 into books  "
      "books:2 free carrying"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -126,3 +127,16 @@ def test_an_example_is_copied_whole(name: str, tmp_path: Path) -> None:
 def test_an_example_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["new", "example", "crane"]) == 2
     assert "no example 'crane'; there are: opcua, paper, pictures" in capsys.readouterr().err
+
+
+@pytest.mark.processes
+def test_a_new_task_passes_check_with_the_lines_of_its_hint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "task", "fetch"]) == 0
+    lines = re.findall(r"^  (\w+ = \{ .*)$", capsys.readouterr().out, re.MULTILINE)
+    cell = 'schema = 1\n[nodes.pc]\nhost = "127.0.0.1"\nport = 7301\n[actions]\n'
+    (tmp_path / "services.toml").write_text(cell + "\n".join(lines).replace("...", "pc"))
+    assert main(["check", "fetch.toml"]) == 0, capsys.readouterr()
+    assert "no node offers" not in capsys.readouterr().out

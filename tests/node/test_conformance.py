@@ -14,6 +14,7 @@ from typing import Any, ClassVar, cast
 
 import pytest
 
+from petrobot.services import conformance
 from petrobot.services.conformance import DriverCheck, check_driver
 from petrobot.services.device import Driver, Ports, key
 from tests.waiting import Limit
@@ -728,3 +729,63 @@ def test_a_cable_that_is_pulled_and_put_back(kind: type[Axis], faults: list[str]
 def test_a_driver_without_cycles_has_no_movements_to_check() -> None:
     found = check_driver(lambda: Driver({}, cast(Ports, None)), simulated=True)
     assert found.faults == [] and "has no `period`" in found.notes[0]
+
+
+class Gripper(Driver):
+    """Its state has no number: nothing tells where it is."""
+
+    period = 0.02
+    obeys = ("speed", "dry_run")
+    left = 0.0
+    shut = False
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if body.get("do") not in ("close", "open"):
+            raise ValueError(f"do: expected close or open, got {body.get('do')!r}")
+        self.left, self.shut = 0.3 / self.speed, body["do"] == "close" and not self.dry_run
+
+    def step(self, now: float) -> None:
+        self.left = max(0.0, self.left - self.period)
+
+    def state(self) -> Mapping[str, Any]:
+        return {"shut": self.shut}
+
+    def stop(self, now: float) -> None:
+        self.left = 0.0
+
+    def stopped(self) -> bool:
+        return self.left == 0.0
+
+
+def test_without_a_position_nothing_measures_its_limits() -> None:
+    found = check_driver(Gripper, [{"do": "open"}, {"do": "close"}], simulated=True)
+    assert "not checked: speed, dry_run: no number of the state tells where the device is" in (
+        found.notes
+    )
+    assert not [text for text in found.faults if "raised" in text], found
+
+
+class SpeedyAxis(Axis):
+    """It says that it obeys `speed`."""
+
+    obeys = ("speed",)
+
+
+def test_a_bug_of_the_check_is_not_a_fault_of_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conformance, "SLOW", 0.0)
+    with pytest.raises(ZeroDivisionError):
+        check_driver(SpeedyAxis, [{"to": 0.1}, {"to": 0.2}], simulated=True)
+
+
+def test_keys_of_the_table_may_be_given() -> None:
+    """As the location file has them; the tests of `speed` add theirs."""
+
+    class Far(SpeedyAxis):
+        reach: float = key(0.0, "m")
+
+        def setup(self) -> None:
+            made.append((self.reach, self.speed))
+
+    made: list[tuple[float, float]] = []
+    check_driver(Far, [{"to": 0.1}, {"to": 0.2}], {"reach": 2.0}, simulated=True)
+    assert {reach for reach, _ in made} == {2.0} and {speed for _, speed in made} >= {1.0, 0.25}

@@ -149,8 +149,13 @@ class Operator:
             }
         elif kind == "run_ended":
             run = state["runs"].pop(change["id"])
-            ended = {key: change[key] for key in ("status", "ended", "reason")}
+            ended = {key: change[key] for key in ("status", "ended", "reason", "deferred")}
             state["ended"] = [*state["ended"], run | ended][-200:]
+        elif kind == "run_judged":
+            said = {key: change[key] for key in ("status", "reason")} | {"deferred": False}
+            state["ended"] = [
+                run | said if run["id"] == change["id"] else run for run in state["ended"]
+            ]
         elif kind == "variable":
             state["variables"][change["name"]] = change["value"]
         elif kind in ENTRIES:

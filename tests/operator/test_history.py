@@ -6,7 +6,18 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.engine import Begin, Choose, Chosen, Engine, RunEnded, StartRun
+from petrobot.coordinator.cli.watch import _line
+from petrobot.coordinator.engine import (
+    Begin,
+    Choose,
+    Chosen,
+    Engine,
+    ForceExit,
+    RunEnded,
+    StartRun,
+    StopConfirmed,
+    Verdict,
+)
 from petrobot.coordinator.operator.history import opened
 from petrobot.coordinator.operator.port import Feed
 from petrobot.coordinator.operator.run_state import ChangePublisher
@@ -36,6 +47,41 @@ done = {}
 [transitions]
 both = { in = ["looking:normal", "moving:normal"], out = ["done"] }
 """
+
+
+def test_live_views_and_history_tell_provisional_ends_verdicts_and_preemption(
+    tmp_path: Path,
+) -> None:
+    """In the words of `petrobot log`."""
+    task, path, feed = loads(JOIN, "join.toml"), tmp_path / "run.journal", Feed()
+    engine, narrator = Engine(task), ChangePublisher(feed, task)
+    narrator.begin("m", "lockstep")
+    lines, state = list[str](), engine.initial()
+    feed.subscribe(lambda change: lines.append(_line(change)))
+    store = JournalStore(JournalWriter(path, {"task": JOIN, "mode": "lockstep"}), 0.0)
+    for stimulus in (
+        Begin(),
+        RunEnded("looking#1", Status.SUCCESS, deferred=True),
+        Verdict("looking#1", Status.FAILURE, "wrong_bin", "A in B"),
+        ForceExit("both"),
+        StopConfirmed("moving#1"),
+    ):
+        narrator.stimulus(0.0, stimulus)
+        state, instructions = engine.handle(state, stimulus)
+        store.append(0.0, stimulus, instructions, state)
+        for instruction in instructions:
+            narrator.instruction(0.0, instruction)
+        narrator.settled(0.0, state)
+    store.writer.close()
+    assert feed.state["ended"][0]["deferred"] is False
+    live = "\n".join(lines)
+    assert "ended    looking#1  provisional SUCCESS" in live
+    assert "judged   looking#1  FAILURE, was SUCCESS  wrong_bin: A in B" in live
+    told = [record["text"] for record in opened(path, "m")["records"]]
+    assert "looking ended: success (provisional)" in told
+    assert "verdict on looking#1: failure (wrong_bin: A in B)" in told
+    assert "ended    moving#1  -  preempted by both, not counted" in live
+    assert "moving has stopped: preempted by both, not counted" in told
 
 
 def test_history_and_live_page_name_the_action_that_did_not_succeed(tmp_path: Path) -> None:

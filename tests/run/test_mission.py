@@ -53,6 +53,37 @@ def test_an_error_of_the_net_is_logged_when_it_occurs(caplog: pytest.LogCaptureF
     assert tally.happened(recovered=False) == "0 runs; 1 value missing [scan#1 gave nothing]"
 
 
+def test_a_missed_goal_names_the_verdict_that_cost_it() -> None:
+    """Not the error before it, from which the task recovered. A preempted run is a run, too."""
+    tally, cell = (
+        MissionTally(0, frozenset({"counted"})),
+        parse(SERVICES.replace("ON_RESUME", "rejoin"), Path("services.toml")),
+    )
+    for n, verdict in enumerate((Status.SUCCESS, Status.FAILURE), 1):
+        tally.instruction(n, Fired(n, "go", (3 - n,), (2 - n,), "Begin", ()))
+        for place, status, cause, cancelled in (
+            ("grip", Status.ERROR, "slipped", False),
+            ("stand", Status.SUCCESS, "", True),
+            ("scan", Status.SUCCESS, "", False),
+        ):
+            end = (f"{place}#{n}", place, place, "do", status, cause, "", Executed.YES, 1.0)
+            tally.instruction(n, RunRecorded(*end, cancelled))
+        verdicts = ("wrong_bin", "A in bin B") if verdict is Status.FAILURE else ()
+        given = (f"scan#{n}", "scan", "do", Status.SUCCESS, verdict)
+        tally.instruction(n, Corrected(*given, *verdicts))
+        if verdict is Status.SUCCESS:
+            tally.instruction(n, Fired(9, "counted", (2 - n,), (2 - n,), "x", ()))
+    told = tally.happened(True, True)
+    assert told.startswith("6 runs, 2 of them preempted; 2 errors, all recovered, 1 of them where")
+    [row] = tally.missed(cell)
+    assert (row["run"], row["cause"], row["text"]) == ("scan#2", "wrong_bin", "A in bin B")
+    assert row["goals"] == 1
+    tally.instruction(9.0, Corrected("scan#2", "scan", "do", Status.FAILURE, Status.SUCCESS))
+    assert [row["run"] for row in tally.missed(cell)] == ["grip#2"]
+    tally.goals += 1  # of which cycle?
+    assert not tally.missed(cell)
+
+
 def test_a_long_mission_run_needs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs that were forgotten still count."""
     monkeypatch.setattr("petrobot.coordinator.run.mission.KEPT", 10)

@@ -30,6 +30,7 @@ from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError
 from petrobot.coordinator.task.file import load as load_task
 from petrobot.services.comm.location_file import (
+    DRY_RUN,
     FIRST_PHYSICS,
     Directory,
     DirectoryError,
@@ -67,9 +68,15 @@ class LoadedPlan:
                     "campaign in another folder"
                 )
         try:
-            return cls(plan, load_task(Path(plan.task)), load_directory(Path(plan.services)))
+            task, directory = load_task(Path(plan.task)), load_directory(Path(plan.services))
         except (OSError, TaskFileError, DirectoryError) as fault:
             raise CampaignError(str(fault)) from fault
+        if directory.plant(scripted=bool(plan.mock), lockstep=True) == DRY_RUN:
+            raise CampaignError(
+                f"{directory.source}: dry_run: a campaign measures nothing while drives are off; "
+                "leave it out, or give another file with --services"
+            )
+        return cls(plan, task, directory)
 
 
 class BlockSelector:

@@ -13,7 +13,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
-from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
 from petrobot.coordinator.studies.campaign.block import PLOTS, LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import write_estimates
 from petrobot.coordinator.studies.campaign.plan import (
@@ -156,7 +155,7 @@ class Campaign:
             name,
             summary.asked(),
             self.plan.physics,
-            MOCK if self.plan.mock else SIMULATED,
+            self.plan.plant,
         )
         return result_of(self.folder, self.plan, summary, self.policy.state())
 

@@ -15,7 +15,7 @@ from petrobot.coordinator.learning.estimate import (
     TrialsKey,
     TrialSums,
 )
-from petrobot.coordinator.learning.estimates_file import SIMULATED, EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
@@ -25,6 +25,7 @@ from petrobot.coordinator.studies.campaign.plan import CampaignError
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry
 from petrobot.coordinator.task import Executed, Status, Task
+from petrobot.services.comm.location_file import SIMULATED
 
 ESTIMATES = "estimates.db"
 

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.services.comm.location_file import same_physics
+from petrobot.services.comm.location_file import MOCK, SIMULATED, same_physics
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
@@ -77,6 +77,11 @@ class CampaignPlan:
             )
         given = {key: value for key, value in data.items() if key != "schema"}
         return cls(**{**given, "regimes": tuple(given["regimes"])})
+
+    @property
+    def plant(self) -> str:
+        """Where its trials take place (`Directory.plant`)."""
+        return MOCK if self.mock else SIMULATED
 
     @property
     def blocks(self) -> list[Block]:

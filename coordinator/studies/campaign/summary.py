@@ -271,6 +271,7 @@ def result_of(
         "regimes": list(plan.regimes),
         "seed": plan.seed,
         "selector": plan.selector,
+        "plant": plan.plant,
         "workers": int(held[-1]["workers"]) if held else 0,
         "rows": str(folder / TABLE),
         "estimates": str(folder / ESTIMATES),

@@ -208,6 +208,7 @@ class CampaignReport:
         """Return the page; `more` are further sections, after the figures."""
         plan = self.plan
         lead = f"{len(self.rows)} of {plan.runs} runs, selector {plan.selector}, seed {plan.seed}"
+        lead += f", {plan.plant}"
         headings = list(dict.fromkeys(heading for heading, _ in self.pictures.values()))
         parts = [
             f"<h1>{escape(self.task.name)}: campaign</h1>",

@@ -114,8 +114,8 @@ class Peers:
             its = mine if mine.split()[-1:] == its.split()[-1:] else its
         if mine and its and mine != its and not self._any_directory:
             text = (
-                f"the caller's services.toml ({its[:12]}) differs from that of {self._node} "
-                f"({mine[:12]})"
+                f"the caller's services.toml ({_short(its)}) differs from that of "
+                f"{self._node} ({_short(mine)})"
             )
             remedy = "copy the same file to each host and start its node again"
             if mine.split()[-1] == its.split()[-1]:
@@ -219,3 +219,9 @@ class Peers:
         """Return whether this caller has been away for this long (s)."""
         peer = self._peers.get(name)
         return peer is None or (not peer.up and now >= peer.down_at + seconds)
+
+
+def _short(directory: str) -> str:
+    """Return the hash of a location file in short, whole words before it."""
+    *words, digest = directory.split()
+    return " ".join((*words, digest[:12]))

@@ -212,6 +212,18 @@ class Directory:
         lock step) counts as on it."""
         return party not in self.nodes or self.nodes[party].host == self.nodes[node].host
 
+    def plant(self, *, scripted: bool, lockstep: bool) -> str:
+        """Return where runs take place: in scripted actions (`mock`), in a cell with drives off
+        (`dry-run`), in a simulated laboratory (also in lock step, whose time is simulated), or in a
+        real cell, with the name of its installation."""
+        if scripted:
+            return MOCK
+        if self.dry_run or any(d.config.get("dry_run") is True for d in self.devices.values()):
+            return DRY_RUN
+        if lockstep or self.laboratory():
+            return SIMULATED
+        return f"{REAL} {self.installation}".strip()
+
     def laboratory(self) -> str:
         """Return the simulated node, empty when there is none."""
         return next((n.name for n in self.nodes.values() if n.sim), "")
@@ -325,6 +337,10 @@ def _seconds(value: float | None) -> float | None:
 FIRST_PHYSICS = "bullet 3.2.7"
 """What made the records of a laboratory that has more than one physics, if they do not say it: at
 first there was only this one."""
+MOCK, DRY_RUN, SIMULATED, REAL = "mock", "dry-run", "simulated", "real"
+"""Plants: scripted actions, a cell with drives off, a simulated laboratory, a real cell (`real
+NAME` if the location file names its installation). "": an older file of
+estimates does not say."""
 
 
 def physics_of(directory: Directory) -> str:

@@ -490,6 +490,7 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
         assert row.trial.runs[0].cost == counted[row.trial.runs[0].action]
     result = campaign.result()
     assert result["judged"]["look"]["cost"] == "count"
+    assert result["plant"] == "mock" and "seed 1, mock" in text_of(result)
     assert result["J"]["look"] == {action: count / 16 for action, count in counted.items()}
     told = [
         "run",

@@ -259,7 +259,7 @@ export class History {
   paintAbout() {
     const { run } = this.reel;
     const from = run.from ? `from ${run.from.run}, ${run.from.record ? `record ${run.from.record}` : "beginning"}` : "";
-    const facts = [`${run.records.length} records`, `${this.reel.firings.length} firings`, run.seed !== undefined && run.seed !== null ? `seed ${run.seed}` : "", run.mode, from].filter(Boolean).join(", ");
+    const facts = [`${run.records.length} records`, `${this.reel.firings.length} firings`, run.seed !== undefined && run.seed !== null ? `seed ${run.seed}` : "", run.mode, run.plant, from].filter(Boolean).join(", ");
     if (!this.other) return fill(this.about, run.fault ? h("span", {}, icon("warning"), ` ${run.fault}. `) : null, facts);
     const [first, shift] = [this.firstDifference(), this.shift];
     const since = shift ? `One run started from a record of the other; they are compared from there on. ` : "";

@@ -214,9 +214,10 @@ export class Banner {
     attribute(this.root, "data-state", stateOf(state));
     text(this.state, stateWord(state));
     text(this.task, words(state.task?.name ?? "no task"));
-    const { from, mode, id } = state.mission;
-    this.mode.hidden = mode !== "lockstep" || !id;
-    text(this.mode, from ? `from record ${from.record}` : "simulated");
+    const { from, mode, id, plant } = state.mission;
+    const unreal = { mock: "scripted actions", "dry-run": "dry run" }[plant];
+    this.mode.hidden = (mode !== "lockstep" && !unreal) || !id;
+    text(this.mode, [from ? `from record ${from.record}` : mode === "lockstep" ? "simulated" : "", unreal].filter(Boolean).join(", "));
     attribute(this.mode, "title", from ? `simulated from ${from.run}` : null);
   }
 }

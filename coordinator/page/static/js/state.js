@@ -41,10 +41,10 @@ const RULES = {
     const run = state.runs[c.id];
     if (!run) return;
     delete state.runs[c.id];
-    append(state, "ended", { ...run, ...pick(c, ["status", "ended", "reason"]) }, ENDED_KEPT);
+    append(state, "ended", { ...run, ...pick(c, ["status", "ended", "reason", "deferred"]) }, ENDED_KEPT);
   },
   run_judged(state, c) {
-    state.ended = state.ended.map((run) => (run.id === c.id ? { ...run, ...pick(c, ["status", "reason"]) } : run));
+    state.ended = state.ended.map((run) => (run.id === c.id ? { ...run, ...pick(c, ["status", "reason"]), deferred: false } : run));
   },
   setpoint(state, c) {
     const known = state.setpoints[c.stream] ?? { samples: [] };

@@ -140,7 +140,7 @@ export class Timeline {
     const reason = run.reason?.text || run.reason?.code;
     const active = activeTime(run, bar.end);
     const held = bar.end - run.started - active;
-    text(this.tip, [`${words(run.action)} on ${run.node}`, `${seconds(active)}, ${run.status ?? run.state ?? "running"}`, held >= 0.01 ? `held for ${seconds(held)}` : "", reason].filter(Boolean).join(" · "));
+    text(this.tip, [`${words(run.action)} on ${run.node}`, `${seconds(active)}, ${run.deferred ? "provisional " : ""}${run.status ?? run.state ?? "running"}`, held >= 0.01 ? `held for ${seconds(held)}` : "", reason].filter(Boolean).join(" · "));
     const box = this.root.getBoundingClientRect();
     this.tip.style.left = `${Math.min(event.clientX - box.left + 12, box.width - 260)}px`;
     this.tip.style.top = `${event.clientY - box.top + 14}px`;
