@@ -638,7 +638,7 @@ class _Check:
                 self.note(f"{', '.join(obeys)}: let `make` take keys of the device's table")
             return
         positions, took = self.measured
-        if obeys and not positions:
+        if obeys and not any(positions.values()):
             self.note(f"{', '.join(obeys)}: no number of the state tells where the device is")
             return
         if "speed" in obeys:
