@@ -46,7 +46,7 @@ def test_the_log_shows_the_text_of_any_result(
     assert main(["report", str(folder), "--out", str(tmp_path / "page")]) == 0
     files = [tmp_path / "run.xes", *(tmp_path / "page_pictures").glob("*.svg")]
     assert len(files) > 1 and all(ElementTree.parse(file) for file in files)
-    assert "script-src 'none'" in (tmp_path / "page").read_text()
+    assert "script-src 'none'" in (tmp_path / "page.html").read_text()
 
 
 def test_json_lines_contain_everything(tmp_path: Path) -> None:
