@@ -258,9 +258,13 @@ def _trainings(
     rows = list(read_table(path / TABLE))
     ran = load_task(str(path / TASK_COPY)) if (path / TASK_COPY).is_file() else None
     same = digest(file) == plan.digests["task"] or _same_form(task, ran)
+    earlier = by_regime(ran, rows, devices_of(cell)) if ran is not None and not same else {}
     if not same:
         rows = of_this_form(task, ran, rows)
-    found = by_regime(task, rows, devices_of(cell), same)
+    found = {
+        regime: replace(training, earlier=earlier.get(regime))
+        for regime, training in by_regime(task, rows, devices_of(cell), same).items()
+    }
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")
     if not any(len(training.runs) for training in found.values()):

@@ -956,9 +956,9 @@ class _Derivation:
         rank = [x.rank for x in moves]
         # An open condition is drawn against its competitors, so its priority, which decides only
         # where it holds, must not decide the draw.
-        number = {x.name: i for i, x in enumerate(moves)}
+        index = {x.name: i for i, x in enumerate(moves)}
         drawn = [
-            (number[name], number[rival])
+            (index[name], index[rival])
             for name in self.switched
             for rival in self._rivals(self.task.transitions[name])
         ]

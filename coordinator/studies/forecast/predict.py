@@ -323,7 +323,11 @@ def _from_net(
     training: Training, request: Request, random: np.random.Generator, asked: Sequence[str]
 ) -> dict[str, Any]:
     net = _SimulatedNet(training)
-    residual = residuals(training, net.replayed(request.seed)) if training.repeats else []
+    tested = training if training.repeats else training.earlier
+    residual = []
+    if tested is not None:
+        known = net if tested is training else _SimulatedNet(tested)
+        residual = residuals(tested, known.replayed(request.seed))
     if request.changes or asked:
         runs = changed(training, training.runs, request.changes)
         net = _SimulatedNet(replace(training, runs=runs, changes=request.changes), asked)

@@ -396,7 +396,7 @@ def event_doubts(training: Training) -> list[str]:
                 and not (by_rate and memory is EventMemory.LATCHED and _by_rate(training, u))
             ):
                 together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
-        if by_rate and memory is EventMemory.LATCHED and reads_variables(t):
+        if by_rate and memory is EventMemory.LATCHED and reads_variables(flat, t):
             out.append(
                 f"{t.name} waits for a latched event and reads variables, which the simulated net "
                 "does not know"
@@ -422,12 +422,12 @@ def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:
     transitions runs left their places."""
     if training.whole:
         return []
-    transitions = training.task.flat.transitions
+    flat = training.task.flat
     return [
         f"{m.name}: an estimates file does not tell how often its condition holds, so it is taken "
         "to hold always; give a campaign's folder"
         for m in moves
-        if m.allowed is None and reads_variables(transitions[m.name])
+        if m.allowed is None and reads_variables(flat, flat.transitions[m.name])
     ]
 
 
@@ -496,6 +496,12 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
             out.append(
                 f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
                 "not allow it: when a run is preempted depends on more than the run"
+            )
+    for names, n in sorted(played.guessed.items()):
+        if n > NEGLIGIBLE * trials:
+            out.append(
+                f"in {n / trials:.1%} of the simulated trials nothing tells which fires, {names}: "
+                "variables decide, and no training trial came there; train with trials of this form"
             )
     for name, n in sorted(played.barred.items()):
         if n > NEGLIGIBLE * trials:
