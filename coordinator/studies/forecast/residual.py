@@ -25,6 +25,8 @@ from petrobot.coordinator.studies.forecast.history import (
 from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.task import EarlyEvent, EventMemory, Transition
+from petrobot.coordinator.task.conditions import equivalent
+from petrobot.coordinator.task.validation import condition_domains
 
 LEVEL = 0.01
 """Significance level at which simulated and measured trials differ, over all tests of a regime
@@ -429,6 +431,40 @@ def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:
         for m in moves
         if m.allowed is None and reads_variables(flat, flat.transitions[m.name])
     ]
+
+
+def branch_doubts(training: Training, moves: Iterable[Move], others: Iterable[str]) -> list[str]:
+    """Return in words which branches that variables decide may be taken more or less often than in
+    the trials: their condition is another one, or runs of `others`, primitive tasks with other
+    choices or shares, write what it reads."""
+    flat, out = training.task.flat, list[str]()
+    ran = training.earlier.task.flat if training.earlier is not None else flat
+    places = flat.places.values()
+    written = {v for p in places if p.task in set(others) for v in p.out.values()}
+    while more := {
+        name
+        for t in flat.transitions.values()
+        for name, value in t.sets
+        if name not in written and value.names & written
+    }:
+        written |= more
+    for m in moves:
+        when, before = m.transition.when, ran.transitions.get(m.name)
+        if when is None or m.allowed is not None or m.known is not None:
+            continue
+        old = None if before is None else before.when  # what the trials tell is that of this one
+        if old is None or not equivalent(old, when, condition_domains(flat)):
+            out.append(
+                f"{m.name}: the trials had another condition there, so how often this one holds is "
+                "not known; train with trials of this form"
+            )
+        elif m.open_ and (read := sorted(when.names & written)):
+            out.append(
+                f"{m.name}: its condition reads {', '.join(read)}, which other choices or shares "
+                "may change, but it is taken to hold as often as in the trials; train with trials "
+                "that choose so"
+            )
+    return out
 
 
 def parallel_doubts(training: Training) -> list[str]:
