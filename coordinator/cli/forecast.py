@@ -17,6 +17,7 @@ from petrobot.coordinator.cli.loading import (
     load_directory,
     load_task,
     task_path,
+    told_if_slow,
     write_json,
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
@@ -171,7 +172,8 @@ def _forecast(options: argparse.Namespace) -> int:
     }
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
-    made = register(task, trainings, requests, about, estimates, cell)
+    with told_if_slow(f"{task.name}: simulating further trials"):
+        made = register(task, trainings, requests, about, estimates, cell)
     doubtful = any(said["doubts"] for said in made["regimes"].values())
     registered = options.out is not None and (options.doubtful or not doubtful)
     if registered:
