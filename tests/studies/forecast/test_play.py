@@ -30,7 +30,7 @@ from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistr
 from petrobot.coordinator.studies.forecast.history import Training, trainings_of
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
-from petrobot.coordinator.studies.forecast.residual import condition_doubts, doubts
+from petrobot.coordinator.studies.forecast.residual import branch_doubts, condition_doubts, doubts
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.conftest import with_transitions
@@ -805,3 +805,30 @@ when = "mode == 'second'"
     played = play(text, [Trial(1, 0.0, runs=[entry("a", 1.0)])], n=5)
     assert played.completed.all() and not played.guessed
     assert played.time.tolist() == [2.0] * 5
+
+
+def test_a_branch_with_another_condition_or_other_values_is_doubtful() -> None:
+    text = BRANCHES + with_transitions("""
+start: jobs -> a
+ready: a:normal -> held
+ok: held -> end
+when = "LOW"
+charge: held -> b
+when = "not (LOW)"
+charged: b:normal -> held
+""")
+    trial = Trial(
+        1, 0.0, 1.0, True, runs=[entry("a", 1.0)], fired={"start": 1, "ready": 1, "ok": 1}
+    )
+    ran = task_of(text.replace("LOW", "low"))
+    place = replace(ran.places["a"], out={"low": "low"})
+    writes = replace(ran, places={**ran.places, "a": place})
+    other = task_of(text.replace("LOW", "low or mode == 'second'"))
+
+    def found(now: Task, *others: str) -> list[str]:
+        training = replace(Training.of(now, [trial]), earlier=Training.of(ran, [trial]))
+        return branch_doubts(training, Structure.of(now).moves, others)
+
+    assert not found(ran, "a") and not found(writes)
+    assert [text.partition(":")[0] for text in found(writes, "a")] == ["ok", "charge"]
+    assert [text.partition(":")[0] for text in found(other)] == ["ok", "charge"]
