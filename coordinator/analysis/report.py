@@ -61,7 +61,7 @@ from petrobot.coordinator.analysis.time.task_forecast import (
 )
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
-from petrobot.coordinator.task.wording import COLUMNS, wrapped
+from petrobot.coordinator.task.wording import COLUMNS, together, wrapped
 
 
 @dataclass(frozen=True)
@@ -465,6 +465,9 @@ class Analysis:
             f"  {w.place}.{w.action}: {100 * w.time_share:.1f} % of the time; error to success: "
             f"{w.completion_gain:+.2e} complete, {w.goal_gain:+.3f} goals"
             for w in f.worth[:SHOWN]
+            if w.time_share >= LEAST_SHARE
+            or abs(w.completion_gain) >= AGREE
+            or w.goal_gain >= AGREE
         ]
         time = (
             f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; mean time "
@@ -492,7 +495,7 @@ class Analysis:
             *(["worth improving:", *rows] if done.probability else []),
             *(f"approximated: {text}" for text in f.approximations),
             *(f"{source}: {', '.join(names)}" for source, names in f.view.numbers.items()),
-            *(f"assumed: {text}" for text in f.view.assumptions),
+            *(f"assumed: {text}" for text in together(f.view.assumptions)),
         ]
 
 
@@ -755,11 +758,15 @@ def _forecast(
     except (ValueError, ArithmeticError, *OUT_OF_MEMORY) as why:
         if INTERRUPTED in str(why):
             raise KeyboardInterrupt from why
-        notes.append(f"no forecast: {_why(why)}")
+        runs = task.places.get(task.runs_place)
+        one = f"; try --what-if {runs.name}=1" if runs is not None and runs.tokens > 1 else ""
+        notes.append(f"no forecast: {_why(why)}{one}")
         return None
     return found
 
 
+LEAST_SHARE = 5e-4
+"""Least share of the time from which an action is worth improving: less is printed as 0.0 %."""
 AGREE = 1e-6
 """Relative difference up to which a figure of two models counts as the same: both are solved to
 about 1e-12."""
@@ -831,9 +838,9 @@ def _as_chain(
     if not off:
         return []
     # What both assume explains no difference.
-    ours = [a for a in view.assumptions if a not in chain.assumptions]
+    ours = together(a for a in view.assumptions if a not in chain.assumptions)
     ours.append("conflicts that neither priority nor weight decides are drawn")
-    theirs = [a for a in chain.assumptions if a not in view.assumptions]
+    theirs = together(a for a in chain.assumptions if a not in view.assumptions)
     there = f"; there: {'; '.join(theirs)}" if theirs else ""
     return [
         f"the execution graph has other figures (both with at most {few} "
@@ -1018,7 +1025,7 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
         *lines,
         "  probability and mean time: a Markov chain on the execution graph, with at most "
         f"{odds.stages} phase{'s' * (odds.stages > 1)} for a duration",
-        *(f"  assumed: {text}" for text in told),
+        *(f"  assumed: {text}" for text in together(told)),
     ]
 
 

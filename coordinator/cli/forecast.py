@@ -17,6 +17,7 @@ from petrobot.coordinator.cli.loading import (
     load_directory,
     load_task,
     task_path,
+    told_if_slow,
     write_json,
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
@@ -176,7 +177,8 @@ def _forecast(options: argparse.Namespace) -> int:
     }
     if options.services is not None:
         _refuse_other_cell(task, options.services, requests, about)
-    made = register(task, trainings, requests, about, estimates, cell)
+    with told_if_slow(f"{task.name}: simulating further trials"):
+        made = register(task, trainings, requests, about, estimates, cell)
     doubtful = any(said["doubts"] for said in made["regimes"].values())
     registered = options.out is not None and (options.doubtful or not doubtful)
     if registered:
@@ -262,9 +264,13 @@ def _trainings(
     rows = list(read_table(path / TABLE))
     ran = load_task(str(path / TASK_COPY)) if (path / TASK_COPY).is_file() else None
     same = digest(file) == plan.digests["task"] or _same_form(task, ran)
+    earlier = by_regime(ran, rows, devices_of(cell)) if ran is not None and not same else {}
     if not same:
         rows = of_this_form(task, ran, rows)
-    found = by_regime(task, rows, devices_of(cell), same)
+    found = {
+        regime: replace(training, earlier=earlier.get(regime))
+        for regime, training in by_regime(task, rows, devices_of(cell), same).items()
+    }
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")
     if not any(len(training.runs) for training in found.values()):

@@ -12,6 +12,7 @@ from petrobot.coordinator.cli.loading import (
     cell_finder,
     measurements,
     task_path,
+    told_if_slow,
 )
 from petrobot.services.host.command_line import LARGEST_SEED, number, whole
 
@@ -79,6 +80,9 @@ def run(options: argparse.Namespace) -> int:
     given["changes"] = options.what_if
     given["measure"] = measurements(options.estimates)
     given["cell_of"] = cell_finder(options.services, options.file)
-    with bounded(options.file):
+    with (
+        bounded(options.file),
+        told_if_slow(f"simulating {options.replicas} replicas (fewer: --replicas)"),
+    ):
         found = simulate_command(task_path(options.file), random, **given)
     return give(found, options.json)

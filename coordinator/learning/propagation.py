@@ -18,7 +18,13 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.ordinary import contended
-from petrobot.coordinator.analysis.time.measured import LATE, Ending, Measured, is_cause
+from petrobot.coordinator.analysis.time.measured import (
+    LATE,
+    Ending,
+    Measured,
+    branching_places,
+    is_cause,
+)
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
@@ -342,13 +348,20 @@ def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, f
 
 
 def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """Return how often each transition with a condition fired: relative frequencies among those
-    that compete."""
+    """Return how often each transition with a condition fired, and each that competes with one:
+    relative frequencies."""
+    flat = task.flat
+    judged = {
+        place
+        for t in flat.transitions.values()
+        if t.when is not None
+        for place in branching_places(flat, t)
+    }
     fired: dict[str, float] = {}
     for key, flow in estimates.flows.items():
-        transition = task.flat.transitions.get(key.transition)
+        transition = flat.transitions.get(key.transition)
         known = key.task == task.name and context in (None, key.context)
-        if known and transition is not None and transition.when is not None:
+        if known and transition is not None and judged & branching_places(flat, transition):
             fired[key.transition] = fired.get(key.transition, 0.0) + flow.fired
     return fired
 

@@ -69,6 +69,16 @@ FEW = 6
 """The most names of a long list that a sentence tells."""
 
 
+def together(texts: Iterable[str]) -> list[str]:
+    """Return texts `NAME: TEXT` so that each TEXT stands once, after all its names."""
+    names: dict[str, list[str]] = {}
+    for text in texts:
+        name, colon, rest = text.partition(": ")
+        own = colon and " " not in name
+        names.setdefault(colon + rest if own else text, []).extend([name] if own else [])
+    return [", ".join(some) + text for text, some in names.items()]
+
+
 def few(words: Sequence[str]) -> str:
     """The words separated by commas; of many the first few, and how many more there are."""
     if len(words) <= FEW + 1:

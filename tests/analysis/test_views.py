@@ -477,6 +477,34 @@ def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() ->
     ].probability == pytest.approx(0.9)
 
 
+@pytest.mark.parametrize(
+    ("priority", "condition"),
+    [(-1, "not seen"), (0, "not seen"), (1, "not seen"), (0, ""), (1, "")],
+)
+@pytest.mark.parametrize("weight", [None, 3.0])
+def test_measured_shares_of_branches_already_contain_priorities_and_weights(
+    priority: int, condition: str, weight: float | None
+) -> None:
+    task = one_step()
+    good = Transition("ok", (taken("act", End.NORMAL),), (Output("done"),), when=parse("seen"))
+    poor = Transition(
+        "soso", (taken("act", End.NORMAL),), (Output("poor"),),
+        when=parse(condition) if condition else None,
+    )  # fmt: skip
+    split = replace(
+        task,
+        places={**task.places, "poor": Place("poor", Kind.RESOURCE)},
+        transitions={
+            **task.transitions,
+            "ok": replace(good, priority=priority, weight=weight),
+            "soso": replace(poor, weight=weight and 1.0),
+        },
+        variables={"seen": Variable("seen", VariableType.BOOL, False)},
+    )
+    found = completed(split, Measured(switches={"ok": 30.0, "soso": 10.0}))[1]
+    assert found.probability == pytest.approx(0.75)
+
+
 def test_unknown_numbers_are_refused_with_a_remedy() -> None:
     task = one_step()
     waits = replace(

@@ -16,6 +16,7 @@ from petrobot.coordinator.task import (
     End,
     Estimate,
     Executed,
+    Kind,
     Place,
     Status,
     Task,
@@ -155,6 +156,16 @@ def is_cause(transition: Transition) -> bool:
     runs = [a for a in transition.inputs if a.end is not None]
     waits = bool(transition.events) or transition.after is not None
     return waits and len(runs) == 1 and runs[0].end is End.PREEMPT
+
+
+def branching_places(task: Task, transition: Transition) -> set[tuple[str, End | None]]:
+    """Return from where a transition takes the tokens whose way its condition decides: transitions
+    with one in common are alternatives. Who merely wants the same resource is none."""
+    return {
+        (a.place, a.end)
+        for a in transition.inputs
+        if a.end is not End.GOING and task.places[a.place].kind is not Kind.RESOURCE
+    }
 
 
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing

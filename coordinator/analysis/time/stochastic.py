@@ -45,6 +45,7 @@ from petrobot.coordinator.analysis.time.measured import (
     NoEstimate,
     Numbers,
     OwnEnd,
+    branching_places,
     is_cause,
 )
 from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
@@ -355,7 +356,6 @@ class _Derivation:
         self.values: dict[str, dict[Scalar, str]] = {}
         """By variable that only transitions set, to known values: the place of each value."""
         self._variables()
-        self.turns = self._turns()
         self.droppable = [x for x in self.compiled.values() if x.after is not None]
         """Transitions with a timer, or with a latched event that the engine may drop."""
         self.timers: dict[tuple[str, frozenset[tuple[str, int]]], str] = {}
@@ -385,6 +385,13 @@ class _Derivation:
         for place in task.places.values():
             if place.kind is Kind.ACTION:
                 self._action_place(place)
+        self.switched = {
+            t.name
+            for t in task.transitions.values()
+            if not self.compiled[t.name].never and any(case.open_ for case in self._cases(t))
+        }
+        """Transitions whose condition is open in some case."""
+        self.turns = self._turns()
         for event in task.events.values():
             if event.scope is Scope.EXTERNAL:
                 self._event(event)
@@ -946,10 +953,22 @@ class _Derivation:
                     readers[read].add(i)
             for name in self.conditions[x.name].names if x.name in self.conditions else ():
                 readers[name].add(i)
+        rank = [x.rank for x in moves]
+        # An open condition is drawn against its competitors, so its priority, which decides only
+        # where it holds, must not decide the draw.
+        index = {x.name: i for i, x in enumerate(moves)}
+        drawn = [
+            (index[name], index[rival])
+            for name in self.switched
+            for rival in self._rivals(self.task.transitions[name])
+        ]
+        while above := [(i, j) for i, j in drawn if rank[i] < rank[j]]:
+            for i, j in above:
+                rank[j] = min(rank[i], rank[j])
         ranks = defaultdict[Any, set[int]](set)
-        for i, x in enumerate(moves):
-            ranks[x.rank].add(i)
-        equal = [ranks[x.rank] for x in moves]
+        for i, own in enumerate(rank):
+            ranks[own].add(i)
+        equal = [ranks[own] for own in rank]
         rivals, spoils, enables = ([set[int]() for _ in moves] for _ in range(3))
         for group in (*takers.values(), *setters.values()):
             for i in group:
@@ -980,7 +999,7 @@ class _Derivation:
             self.doubts.append(f"{names}: {text}")
         ring = _groups(len(moves), hard | soon)
         level = _levels(len(moves), hard | {(i, j) for i, j in soon if ring[i] != ring[j]})
-        keys = [(x.rank, n) for x, n in zip(moves, level, strict=True)]
+        keys = list(zip(rank, level, strict=True))
         order = sorted(set(keys), reverse=True)
         return {x.name: order.index(key) for x, key in zip(moves, keys, strict=True)}
 
@@ -1108,7 +1127,9 @@ class _Derivation:
                 self.assumptions.append(f"{t.name}: its condition holds when its time is over")
             self._timer(t, name, case, give, priority)
             return
-        share = self._switch(t) if case.open_ else 1.0
+        drawn = case.open_ or bool(self._rivals(t) & self.switched)
+        measured = drawn and t.name in self.measured.switches
+        share = self._switch(t) if measured or case.open_ else 1.0
         need |= {f"event {e}": 1 for e in t.events if e in self.flags}
         if t.name in self.called:
             self._immediate(name, need | {self.called[t.name]: 1}, give, share, self.served[t.name])
@@ -1116,9 +1137,10 @@ class _Derivation:
             rate = share / self.numbers.wait(event)
             self._timed(name, need, give, rate, self._wait_source(event), 1)
         else:
-            weight = share * (t.weight if t.weight is not None else 1.0)
-            source = "weight declared in the task file" if t.weight is not None else ""
-            if case.open_ and t.name in self.measured.switches:
+            declared = t.weight is not None and not measured  # how often it fired contains it
+            weight = t.weight if t.weight is not None and declared else share
+            source = "weight declared in the task file" if declared else ""
+            if measured:
                 source = "measured frequency of its condition"
             self._immediate(name, need, give, weight, priority, source)
 
@@ -1158,10 +1180,10 @@ class _Derivation:
         return known * len(shares) / sum(shares)
 
     def _rivals(self, t: Transition) -> set[str]:
-        """Return the other transitions that take tokens from the same places."""
-        mine = {a.place for a in t.inputs}
+        """Return the other transitions among which the condition of a transition chooses."""
+        mine = branching_places(self.task, t)
         others = (u for u in self.task.transitions.values() if u.name != t.name)
-        return {u.name for u in others if mine & {a.place for a in u.inputs}}
+        return {u.name for u in others if mine & branching_places(self.task, u)}
 
     def _wait_source(self, event: str) -> str:
         measured = event in self.measured.waits

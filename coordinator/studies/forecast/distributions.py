@@ -192,6 +192,7 @@ class RunDistributions:
     ) -> None:
         """`chosen`: places whose choices may change outcomes elsewhere."""
         self.vocabulary = training.vocabulary
+        self.fired = [trial.fired for trial in training.trials]
         self._chosen = chosen
         self.contexts: dict[tuple[int, int], ContextNode] = {}
         self._numbers = 0
@@ -446,6 +447,13 @@ class Ends:
     """The run lasts longer than any observed one: its end is an extrapolation."""
 
 
+FEWEST_WAYS = 30
+"""Least number of firings from which the way that tokens take depends on how many came before."""
+Branches = Mapping[tuple[int, ...], Values]
+"""How often each alternative fired (replicates, alternatives): after which other one (-1: none),
+and as the how-manieth in its trial (from 0); by the first alone; by neither."""
+
+
 class Drawer:
     """Draws ends of runs and waits, for many replicates at once, each with its own bootstrap
     weights of the trials.
@@ -651,6 +659,31 @@ class Drawer:
         )
         index: Codes = np.clip(at - replicate * members, 0, members - 1)
         return index
+
+    def branches(self, members: Sequence[str]) -> Branches:
+        """Return what the trials tell of the way that tokens take where several transitions are
+        alternatives."""
+        found = dict[tuple[int, ...], list[tuple[int, int]]]()
+        number = {name: i for i, name in enumerate(members)}
+        for trial, fired in enumerate(self._runs.fired):
+            # `fired` has the order of the first firings; repeated ones are taken to come together
+            ways = [number[t] for t, n in fired.items() if t in number for _ in range(n)]
+            for k, way in enumerate(ways):
+                before = ways[k - 1] if k else -1
+                for context in ((), (before,), (before, k)):
+                    found.setdefault(context, []).append((trial, way))
+        return {
+            context: self._shares(np.array(told).T, len(members))
+            for context, told in found.items()
+            if len(context) < 2 or len(told) >= FEWEST_WAYS
+        }
+
+    def _shares(self, told: Codes, members: int) -> Values:
+        """Return the share of each member by replicate, from (trials, ways) of its firings."""
+        trials, ways = told
+        each = self._weights[:, trials]
+        each = np.where(each.sum(axis=1, keepdims=True) > 0, each, 1.0)
+        return np.stack([each[:, ways == i].sum(axis=1) for i in range(members)], axis=1)
 
     def chance(self, n: int) -> Values:
         """Return uniform numbers."""

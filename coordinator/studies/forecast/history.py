@@ -80,7 +80,7 @@ class RunVocabulary:
         taking = [
             t
             for t in flat.transitions.values()
-            if t.events or t.after is not None or reads_variables(t)
+            if t.events or t.after is not None or reads_variables(flat, t)
         ]
         cutting = [
             t.name
@@ -207,6 +207,9 @@ class Training:
     same: bool = True
     """False if the trials are of an earlier form of the task: they tell of its runs, but not what
     whole trials come to."""
+    earlier: Training | None = None
+    """The same trials as those of the form that was run, if it is known: they test how well its
+    simulated net repeats them."""
     changes: Sequence[Change] = ()
     """Other durations and shares than the trials have; `runs` has them already."""
 
@@ -484,12 +487,30 @@ def _is_cut_off(vocabulary: RunVocabulary, run: RunEntry) -> bool:
     return not run.status
 
 
-def reads_variables(t: Transition) -> bool:
-    """Return whether a transition's condition reads more than the statuses of the runs that it
-    takes."""
-    return t.when is not None and not t.when.names <= {
-        f"{a.place}.status" for a in t.inputs if a.end is not None
+def known_variables(flat: Task) -> set[str]:
+    """Return the names whose values follow from what fired: parameters, and variables that only
+    transitions write, out of such names."""
+    written: dict[str, set[str]] = {}
+    for t in flat.transitions.values():
+        for name, value in t.sets:
+            written.setdefault(name, set()).update(value.names)
+    known = (set(written) | set(flat.parameters)) - {
+        v for p in flat.places.values() for v in p.out.values()
     }
+    while unsure := {n for n in known if written.get(n, set()) - known}:
+        known -= unsure
+    return known
+
+
+def reads_variables(flat: Task, t: Transition) -> bool:
+    """Return whether a transition's condition reads more than the statuses of the runs that it
+    takes, and than known variables alone."""
+    statuses = {f"{a.place}.status" for a in t.inputs if a.end is not None}
+    return (
+        t.when is not None
+        and not t.when.names <= statuses
+        and not t.when.names <= known_variables(flat)
+    )
 
 
 # --- what if ---

@@ -11,7 +11,12 @@ import numpy as np
 
 from petrobot.coordinator.analysis.time.measured import EMERGENCY, FIELDS, is_cause
 from petrobot.coordinator.learning.waits import memory_of
-from petrobot.coordinator.studies.forecast.history import STATUSES, RunVocabulary, reads_variables
+from petrobot.coordinator.studies.forecast.history import (
+    STATUSES,
+    RunVocabulary,
+    known_variables,
+    reads_variables,
+)
 from petrobot.coordinator.task import (
     EarlyEvent,
     End,
@@ -26,7 +31,8 @@ from petrobot.coordinator.task.compiled_task import (
     CompiledTransition,
     compile_transitions,
 )
-from petrobot.coordinator.task.conditions import ConditionFault, Literal, walk
+from petrobot.coordinator.task.conditions import ConditionFault, Expression, Literal, walk
+from petrobot.coordinator.task.conditions.language import Scalar
 from petrobot.coordinator.task.net import CompiledNet
 
 
@@ -47,6 +53,10 @@ class Move:
     allowed: np.ndarray | None
     """Which statuses of the ended runs it takes (axes: its arcs) its condition admits; None:
     any."""
+    known: Expression | None
+    """Its condition, if it follows from what fired before."""
+    open_: bool
+    """Nothing but how often it fired tells whether its condition holds."""
     is_goal: bool
     takes_run: bool
     """It takes a token out of the runs place."""
@@ -86,6 +96,8 @@ class Structure:
     codes: Mapping[int, int]
     """By index in the net of an action place: its code in the vocabulary."""
     assumptions: tuple[str, ...]
+    first_values: Mapping[str, Scalar | None]
+    """What known variables hold when the task begins."""
 
     @classmethod
     def of(cls, task: Task, whole: bool = True) -> Structure:
@@ -105,18 +117,21 @@ class Structure:
         if flat.runs_place:
             initial[flat.net.place_index[flat.runs_place]] = 1
         codes = {flat.net.place_index[name]: q for q, name in enumerate(vocabulary.places)}
-        source = (
+        taken = (
             "how often its condition holds is taken from the runs that it took"
             if whole
             else "its condition is taken to hold as for runs that were executed, and that no "
             "emergency stop ended"
         )
+        fired = "how often its condition holds is taken from how often it fired in the trials"
         assumptions = tuple(
-            f"{m.name}: {source}"
+            f"{m.name}: {fired if m.open_ else taken}"
             for t, m in zip(flat.transitions.values(), moves, strict=True)
-            if reads_variables(t) and (whole or m.allowed is not None)
+            if reads_variables(flat, t) and (whole or m.allowed is not None)
         )
-        return cls(flat, vocabulary, moves, initial, flat.net.compiled, codes, assumptions)
+        values = flat.initial_variables()
+        first = {name: values[name] for name in sorted(known_variables(flat))}
+        return cls(flat, vocabulary, moves, initial, flat.net.compiled, codes, assumptions, first)
 
 
 def _move(
@@ -126,13 +141,18 @@ def _move(
 ) -> Move:
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
+    ends = [a.name for a in compiled.actions if a.end in (End.NORMAL, End.ERROR)]
+    allowed = _allowed(t, ends)
+    known = t.when is not None and allowed is None and t.when.names <= known_variables(flat)
     return Move(
         compiled,
         is_cause(t),
         bool(t.events) or t.after is not None,
         memory_of(flat, t),
         max(means) if means and len(means) == len(waits_known) else None,
-        _allowed(t, [a.name for a in compiled.actions if a.end in (End.NORMAL, End.ERROR)]),
+        allowed,
+        t.when if known else None,
+        t.when is not None and allowed is None and not known and not ends,
         t.name in flat.goal_transitions,
         any(a.place == flat.runs_place for a in t.inputs),
     )
@@ -153,7 +173,7 @@ def _refuse_unknown_preemption(task: Task, t: Transition) -> None:
         )
     if is_cause(t) or not any(a.end is End.PREEMPT for a in runs):
         return
-    if reads_variables(t) and not any(a.end in (End.NORMAL, End.ERROR) for a in runs):
+    if reads_variables(task, t) and not any(a.end in (End.NORMAL, End.ERROR) for a in runs):
         raise ValueError(
             f"transitions.{t.name}: when it preempts is decided by variables alone, and "
             "forecasts know no variables; let it take "

@@ -23,6 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from petrobot.coordinator.analysis.net.pack import concession
+from petrobot.coordinator.analysis.time.measured import branching_places
 from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
@@ -37,6 +38,7 @@ from petrobot.coordinator.task import (
     Task,
 )
 from petrobot.coordinator.task.compiled_task import ActionArc
+from petrobot.coordinator.task.conditions import ConditionFault, Expression
 from petrobot.coordinator.task.net import Marking
 
 IDLE, QUEUED, GOING, DONE = range(4)
@@ -75,6 +77,8 @@ class Played:
     barred: Mapping[str, int] = field(default_factory=dict)
     """By transition: trials that came to a stop where it could have started a run in a place of
     which nothing was measured. It never fires."""
+    guessed: Mapping[str, int] = field(default_factory=dict)
+    """By transitions: trials in which no training trial tells which one of them fires."""
     ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By action place: how often each transition took a token out of it."""
 
@@ -95,6 +99,55 @@ def _is_latched(m: Move, drawer: Drawer) -> bool:
     """Return whether the move waits for a latched event of which the rate is known."""
     latched = m.memory is not None and m.memory[0] is EventMemory.LATCHED
     return latched and not drawer.as_measured(m.name)
+
+
+class _Fork:
+    """Alternatives among which variables decide that the trials do not tell: one is drawn as often
+    as it fired, and stays until it fires or cannot any more. Priorities and weights are in that."""
+
+    def __init__(self, moves: Sequence[Move], drawer: Drawer, n: int) -> None:
+        self.moves, self._drawer = moves, drawer
+        self._shares = drawer.branches([m.name for m in moves])
+        self.chosen, self._last = np.full((2, n), -1)
+        self._count = np.zeros(n, np.int64)
+        self._open = np.array([m.open_ for m in moves])
+
+    def keep(self, kept: Mask) -> None:
+        """Continue with some columns."""
+        self.chosen, self._last = self.chosen[kept], self._last[kept]
+        self._count = self._count[kept]
+
+    def fired(self, number: int, columns: Codes) -> None:
+        """Note which one fired."""
+        self.chosen[columns], self._last[columns] = -1, number
+        self._count[columns] += 1
+
+    def choose(self, able: Mask, replicate: Codes) -> Codes:
+        """Choose among those that are able (moves, columns) where one of them has a condition that
+        is open. Return the columns in which nothing tells which."""
+        columns = np.arange(able.shape[1])
+        stays = (self.chosen >= 0) & able[np.maximum(self.chosen, 0), columns]
+        self.chosen = np.where(stays, self.chosen, -1)
+        fresh = np.flatnonzero(~stays & able[self._open].any(axis=0))
+        if not len(fresh):
+            return fresh
+        mine = able[:, fresh].T
+        share, found = np.zeros(mine.shape), np.zeros(len(fresh), np.bool_)
+        contexts = np.stack([self._last[fresh], self._count[fresh]], axis=1)
+        for length in (2, 1, 0):
+            for context in np.unique(contexts[~found, :length], axis=0).tolist():
+                told = self._shares.get(tuple(context))
+                if told is None:
+                    continue
+                own = np.flatnonzero(~found & (contexts[:, :length] == context).all(axis=1))
+                share[own] = told[replicate[fresh[own]]] * mine[own]
+                found[own] = share[own].sum(axis=1) > 0.0
+        share[~found] = mine[~found]
+        bounds = np.cumsum(share, axis=1)
+        draw = self._drawer.chance(len(fresh)) * bounds[:, -1]
+        self.chosen[fresh] = (bounds <= draw[:, None]).sum(axis=1)
+        guessed: Codes = fresh[~found & (mine.sum(axis=1) > 1)]
+        return guessed
 
 
 class Play:
@@ -140,9 +193,17 @@ class Play:
             for m in self._quick
             if m.ended
             and not m.waits
-            and (m.allowed is not None or structure.task.transitions[m.name].when is None)
+            and (m.allowed is not None or m.known is not None or m.transition.when is None)
         ]
         """Transitions that take an ended run and surely fire as soon as the marking allows it."""
+        self._forks = [_Fork(members, drawer, n) for members in self._alternatives(free)]
+        self._fork_of = {
+            m.number: (fork, i) for fork in self._forks for i, m in enumerate(fork.moves)
+        }
+        """By transition: where it is an alternative, and as which one."""
+        self._valuations = [self._s.first_values]
+        self._valuation = np.zeros(n, np.int64)
+        """By column: the index of the values of its known variables."""
         contested = contested_places([m.transition for m in structure.moves])
         self._contests = [
             (i, place, weight)
@@ -236,6 +297,7 @@ class Play:
             for i, clock in enumerate(self._latched):
                 if clock is not None:
                     able[i] &= self._due[clock] <= self._now
+            self._choose_ways(able)
             some: Mask = np.asarray(able.any(axis=0))
             if not some.any():
                 if self._release():
@@ -256,6 +318,62 @@ class Play:
             f"{self._s.task.name}: transitions fire for ever without time going on; run "
             "petrobot check"
         )
+
+    def _alternatives(self, moves: Sequence[Move]) -> list[list[Move]]:
+        """Return the groups of transitions that take tokens from the same places, where the
+        condition of one is open."""
+        task, groups = self._s.task, list[tuple[set[Any], list[Move]]]()
+        for m in moves:
+            places, members = branching_places(task, task.transitions[m.name]), [m]
+            for group in [g for g in groups if g[0] & places]:
+                groups.remove(group)
+                places, members = places | group[0], [*group[1], *members]
+            groups.append((places, members))
+        return [members for _, members in groups if any(m.open_ and not m.waits for m in members)]
+
+    def _choose_ways(self, able: Mask) -> None:
+        """Leave only the chosen one of alternatives able. One that waits may be chosen, too: then
+        nothing fires before it."""
+        quick = {m.number: i for i, m in enumerate(self._quick)}
+        for fork in self._forks:
+            rows = [quick.get(m.number) for m in fork.moves]
+            mine = np.array(
+                [
+                    self._enabled(m) if i is None or m.waits else able[i]
+                    for i, m in zip(rows, fork.moves, strict=True)
+                ]
+            )
+            waiting = np.array([m.waits for m in fork.moves])
+            mine[waiting] &= mine[~waiting].any(axis=0)
+            guessed = fork.choose(mine, self._replicate)
+            self._note_odd("guessed", " or ".join(m.name for m in fork.moves), guessed)
+            for k, i in enumerate(rows):
+                if i is not None and not fork.moves[k].waits:
+                    able[i] &= (fork.chosen == k) | (fork.chosen < 0)
+
+    def _holds(self, condition: Expression) -> Mask:
+        """Return where a condition on known variables is true."""
+        codes, where = np.unique(self._valuation, return_inverse=True)
+        held = []
+        for code in codes.tolist():
+            try:
+                held.append(condition.holds(self._valuations[code]))
+            except ConditionFault:
+                held.append(False)
+        return np.array(held, np.bool_)[where]
+
+    def _set(self, m: Move, columns: Codes) -> None:
+        """Write known variables."""
+        written = self._valuation[columns]
+        for code in np.unique(written).tolist():
+            before = self._valuations[code]
+            after = before | {
+                name: value.value(before) for name, value in m.transition.sets if name in before
+            }
+            if after not in self._valuations:
+                self._valuations.append(after)
+            own = columns[written == code]
+            self._valuation[own] = self._valuations.index(after)
 
     def _release(self) -> bool:
         """Let ended runs leave by a transition that surely fires in the engine, where their
@@ -308,6 +426,8 @@ class Play:
         for arc in m.transition.actions:
             fitting = [self._fits(m, arc, r) for r in self._runs_of(arc)]
             out &= sum(fitting[1:], fitting[0].astype(np.int64)) >= arc.weight
+        if m.known is not None:
+            out &= self._holds(m.known)
         if m.allowed is not None:
             runs = product(*(self._runs_of(arc) for arc in m.ended))
             out &= np.any([self._admits(m, m.allowed, those) for those in runs], axis=0)
@@ -382,6 +502,11 @@ class Play:
         if m.takes_run:
             self._begun[columns], self._taken[columns] = self._now[columns], True
         self._goals[columns] += m.is_goal
+        if m.number in self._fork_of:
+            fork, i = self._fork_of[m.number]
+            fork.fired(i, columns)
+        if m.transition.sets:
+            self._set(m, columns)
         for place, weight, is_action in m.transition.produce:
             if is_action:
                 taken.append(self._s.codes[place])
@@ -635,7 +760,11 @@ class Play:
         self._out.time[own] = np.where(done, self._now[over] - self._begun[over], np.nan)
         kept = ~over
         self._seen = self._seen.of(kept)
-        for name in ("_column", "_replicate", "_now", "_begun", "_taken", "_goals", "_good"):
+        for fork in self._forks:
+            fork.keep(kept)
+        for name in (
+            "_column", "_replicate", "_now", "_begun", "_taken", "_goals", "_good", "_valuation",
+        ):  # fmt: skip
             setattr(self, name, getattr(self, name)[kept])
         for name in (*_BY_RUN, "_tokens", "_due", "_since"):
             setattr(self, name, getattr(self, name)[:, kept])

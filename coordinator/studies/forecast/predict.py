@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.time.whatif import Change
+from petrobot.coordinator.analysis.time.whatif import Change, statuses_of
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
 from petrobot.coordinator.studies.forecast.direct import (
     LEAST,
@@ -35,6 +35,7 @@ from petrobot.coordinator.studies.forecast.history import Codes, Training, Value
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
+    branch_doubts,
     chosen_so,
     condition_doubts,
     doubts,
@@ -323,7 +324,11 @@ def _from_net(
     training: Training, request: Request, random: np.random.Generator, asked: Sequence[str]
 ) -> dict[str, Any]:
     net = _SimulatedNet(training)
-    residual = residuals(training, net.replayed(request.seed)) if training.repeats else []
+    tested = training if training.repeats else training.earlier
+    residual = []
+    if tested is not None:
+        known = net if tested is training else _SimulatedNet(tested)
+        residual = residuals(tested, known.replayed(request.seed))
     if request.changes or asked:
         runs = changed(training, training.runs, request.changes)
         net = _SimulatedNet(replace(training, runs=runs, changes=request.changes), asked)
@@ -344,6 +349,9 @@ def _from_net(
             *doubts(residual, whole, request.point),
             *event_doubts(training),
             *condition_doubts(training, net.structure.moves),
+            *branch_doubts(
+                training, net.structure.moves, {*asked, *_reshared(training, request.changes)}
+            ),
             *parallel_doubts(training),
             *limit_doubts(training),
             *order_doubts(training),
@@ -377,6 +385,12 @@ def _net_time(value: float, samples: Values, runs: int, training: int) -> dict[s
     alone = sd / np.sqrt(1.0 + training / runs)
     both = np.array([SCORES[3], -SCORES[3]])
     return time_figure(value, value + sd * SCORES, value + alone * both)
+
+
+def _reshared(training: Training, changes: Sequence[Change]) -> set[str]:
+    """Return the primitive tasks whose runs end otherwise."""
+    shares = [change for change in changes if change.subject[-1] == "share"]
+    return {statuses_of(training.task, change)[0].name for change in shares}
 
 
 class _SimulatedNet:

@@ -23,8 +23,9 @@ from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.propagation import ChoiceShares, limits_of, measured_from
 from petrobot.coordinator.studies.campaign.observed import context_of, observation
+from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
-from petrobot.coordinator.studies.forecast.predict import Request, predict
+from petrobot.coordinator.studies.forecast.predict import NET, Request, predict
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.services.host.json_text import finite, json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
@@ -42,6 +43,10 @@ METHOD = (
 )
 LARGEST = 50_000
 """Largest number of markings for which the stochastic view is solved."""
+CONTRADICTS_SHARE, CONTRADICTS_TIME = 0.1, 0.25
+"""By how much a share, and relatively a mean time, of simulated net and stochastic view may differ.
+Phase-type fits keep each mean and share; races of parallel runs, and statuses that depend on each
+other, explain no more in all that was tried."""
 JUMPS = 20_000
 """Largest number of jumps of the uniformised chain for which its quantile is computed."""
 
@@ -79,6 +84,9 @@ def register(
                     apart=by_place(trainings[name]),
                     changes=request.changes,
                 )
+                doubts = contradictions(regimes[name], regimes[name]["gspn"])
+                if doubts and not _views_miss(trainings[name], estimates, name, cell):
+                    regimes[name]["doubts"] += doubts
         except ValueError as fault:
             raise ForecastError(f"regime {name or '-'}: {fault}") from fault
     told = {
@@ -200,6 +208,42 @@ def exact(
         "markings": found.chain.n,
         "notes": [*again, *found.later],
     }
+
+
+def contradictions(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str]:
+    """Return in words where simulated net and stochastic view contradict each other, if no trial
+    tells which of them is right: by more than fitted durations explain."""
+    tested = said["whole"] and said["same"] and not said["asked"] and not said.get("what_if")
+    if said["from"] != NET or tested or "why" in view:
+        return []
+    out = []
+    for name in ("R_goal", "P_complete", "mean"):
+        figure, other = said["figures"].get(name), view[name]
+        if figure is None or other is None or figure["value"] is None:
+            continue
+        value, (low, high) = figure["value"], figure["confidence"]
+        limit = CONTRADICTS_TIME * value if name == "mean" else CONTRADICTS_SHARE
+        if abs(other - value) > limit and not low <= other <= high:
+            out.append(
+                f"{name} is {value:.4g} by the simulated net, but {other:.4g} by the stochastic "
+                "view, and no trial tells which is right; run a campaign of this form"
+            )
+    return out
+
+
+def _views_miss(training: Training, estimates: Estimates, regime: str, cell: Cell | None) -> bool:
+    """Return whether the stochastic view contradicts the trials themselves, in the form that was
+    run: then it does not judge another form."""
+    known = training.earlier or training
+    if not known.repeats:
+        return False
+    choices = choices_of(known)
+    seen = predict(known, Request(len(known.trials), choices, net=False)) | {
+        "from": NET,
+        "same": False,
+    }
+    view = exact(known.task, estimates, regime, choices, cell, apart=by_place(known))
+    return bool(contradictions(seen, view))
 
 
 def by_place(training: Training) -> dict[str, dict[str, Tally]]:

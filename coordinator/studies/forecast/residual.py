@@ -25,6 +25,8 @@ from petrobot.coordinator.studies.forecast.history import (
 from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.task import EarlyEvent, EventMemory, Transition
+from petrobot.coordinator.task.conditions import equivalent
+from petrobot.coordinator.task.validation import condition_domains
 
 LEVEL = 0.01
 """Significance level at which simulated and measured trials differ, over all tests of a regime
@@ -396,7 +398,7 @@ def event_doubts(training: Training) -> list[str]:
                 and not (by_rate and memory is EventMemory.LATCHED and _by_rate(training, u))
             ):
                 together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
-        if by_rate and memory is EventMemory.LATCHED and reads_variables(t):
+        if by_rate and memory is EventMemory.LATCHED and reads_variables(flat, t):
             out.append(
                 f"{t.name} waits for a latched event and reads variables, which the simulated net "
                 "does not know"
@@ -422,13 +424,47 @@ def condition_doubts(training: Training, moves: Iterable[Move]) -> list[str]:
     transitions runs left their places."""
     if training.whole:
         return []
-    transitions = training.task.flat.transitions
+    flat = training.task.flat
     return [
         f"{m.name}: an estimates file does not tell how often its condition holds, so it is taken "
         "to hold always; give a campaign's folder"
         for m in moves
-        if m.allowed is None and reads_variables(transitions[m.name])
+        if m.allowed is None and reads_variables(flat, flat.transitions[m.name])
     ]
+
+
+def branch_doubts(training: Training, moves: Iterable[Move], others: Iterable[str]) -> list[str]:
+    """Return in words which branches that variables decide may be taken more or less often than in
+    the trials: their condition is another one, or runs of `others`, primitive tasks with other
+    choices or shares, write what it reads."""
+    flat, out = training.task.flat, list[str]()
+    ran = training.earlier.task.flat if training.earlier is not None else flat
+    places = flat.places.values()
+    written = {v for p in places if p.task in set(others) for v in p.out.values()}
+    while more := {
+        name
+        for t in flat.transitions.values()
+        for name, value in t.sets
+        if name not in written and value.names & written
+    }:
+        written |= more
+    for m in moves:
+        when, before = m.transition.when, ran.transitions.get(m.name)
+        if when is None or m.allowed is not None or m.known is not None:
+            continue
+        old = None if before is None else before.when  # what the trials tell is that of this one
+        if old is None or not equivalent(old, when, condition_domains(flat)):
+            out.append(
+                f"{m.name}: the trials had another condition there, so how often this one holds is "
+                "not known; train with trials of this form"
+            )
+        elif m.open_ and (read := sorted(when.names & written)):
+            out.append(
+                f"{m.name}: its condition reads {', '.join(read)}, which other choices or shares "
+                "may change, but it is taken to hold as often as in the trials; train with trials "
+                "that choose so"
+            )
+    return out
 
 
 def parallel_doubts(training: Training) -> list[str]:
@@ -496,6 +532,12 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
             out.append(
                 f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
                 "not allow it: when a run is preempted depends on more than the run"
+            )
+    for names, n in sorted(played.guessed.items()):
+        if n > NEGLIGIBLE * trials:
+            out.append(
+                f"in {n / trials:.1%} of the simulated trials nothing tells which fires, {names}: "
+                "variables decide, and no training trial came there; train with trials of this form"
             )
     for name, n in sorted(played.barred.items()):
         if n > NEGLIGIBLE * trials:

@@ -111,9 +111,9 @@ def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
         (
             row["regime"] or "-",
             WORDS[row["figure"]],
-            _number(row["forecast"]),
+            _number(row["forecast"]) or "none completes",
             _interval(row["interval"]),
-            _number(row["measured"]),
+            _number(row["measured"]) or "none completed",
             _p(row),
             _agrees(row),
             f"{'yes' if row['equivalent'] else 'no'} (within {_number(row['margin'])})"

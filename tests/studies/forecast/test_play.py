@@ -30,7 +30,7 @@ from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistr
 from petrobot.coordinator.studies.forecast.history import Training, trainings_of
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
-from petrobot.coordinator.studies.forecast.residual import condition_doubts, doubts
+from petrobot.coordinator.studies.forecast.residual import branch_doubts, condition_doubts, doubts
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.conftest import with_transitions
@@ -752,3 +752,83 @@ b_lost: b:error -> end
     found = condition_doubts(training, Structure.of(training.task, whole=False).moves)
     assert [doubt.partition(":")[0] for doubt in found] == ["again", "a_lost"]
     assert condition_doubts(replace(training, whole=True), Structure.of(training.task).moves) == []
+
+
+BRANCHES = """
+[variables]
+low = { type = "bool" }
+mode = { type = "str", initial = "first" }
+[places.held]
+kind = "control"
+"""
+
+
+@pytest.mark.parametrize("priority", ["", "\npriority = 1"])
+def test_branches_that_variables_decide_are_taken_as_in_the_trials(priority: str) -> None:
+    """A battery that is low in 0.2 of the trials, and never after it was charged."""
+    text = BRANCHES + with_transitions(f"""
+start: jobs -> a
+ready: a:normal -> held
+ok: held -> end
+when = "not low"
+charge: held -> b{priority}
+when = "low"
+charged: b:normal -> held
+""")
+    trials = [
+        Trial(
+            1, 0.0, 3.0 if k % 5 == 0 else 1.0, True,
+            runs=[entry("a", 1.0), entry("b", 2.0)][: 1 + (k % 5 == 0)],
+            fired={"start": 1, "ready": 1}
+            | ({"charge": 1, "charged": 1} if k % 5 == 0 else {})
+            | {"ok": 1},
+        )
+        for k in range(100)
+    ]  # fmt: skip
+    played = play(text, trials, n=4000)
+    assert played.completed.all()
+    assert set(np.round(played.time, 6)) == {1.0, 3.0}
+    assert float(np.mean(played.time > 2.0)) == pytest.approx(0.2, abs=0.02)
+
+
+def test_variables_that_transitions_set_are_played_as_the_engine_does() -> None:
+    """The second run takes the other way, although no trial did."""
+    text = BRANCHES + with_transitions("""
+start: jobs -> a
+again: a:normal -> held
+when = "mode == 'first'"
+set = { mode = "'second'" }
+back: held -> a
+done: a:normal -> end
+when = "mode == 'second'"
+""")
+    played = play(text, [Trial(1, 0.0, runs=[entry("a", 1.0)])], n=5)
+    assert played.completed.all() and not played.guessed
+    assert played.time.tolist() == [2.0] * 5
+
+
+def test_a_branch_with_another_condition_or_other_values_is_doubtful() -> None:
+    text = BRANCHES + with_transitions("""
+start: jobs -> a
+ready: a:normal -> held
+ok: held -> end
+when = "LOW"
+charge: held -> b
+when = "not (LOW)"
+charged: b:normal -> held
+""")
+    trial = Trial(
+        1, 0.0, 1.0, True, runs=[entry("a", 1.0)], fired={"start": 1, "ready": 1, "ok": 1}
+    )
+    ran = task_of(text.replace("LOW", "low"))
+    place = replace(ran.places["a"], out={"low": "low"})
+    writes = replace(ran, places={**ran.places, "a": place})
+    other = task_of(text.replace("LOW", "low or mode == 'second'"))
+
+    def found(now: Task, *others: str) -> list[str]:
+        training = replace(Training.of(now, [trial]), earlier=Training.of(ran, [trial]))
+        return branch_doubts(training, Structure.of(now).moves, others)
+
+    assert not found(ran, "a") and not found(writes)
+    assert [text.partition(":")[0] for text in found(writes, "a")] == ["ok", "charge"]
+    assert [text.partition(":")[0] for text in found(other)] == ["ok", "charge"]

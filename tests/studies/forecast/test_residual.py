@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.play import Played
 from petrobot.coordinator.studies.forecast.predict import Request, predict
+from petrobot.coordinator.studies.forecast.registered import contradictions
 from petrobot.coordinator.studies.forecast.residual import (
     doubts,
     measured,
@@ -230,3 +232,33 @@ def test_the_order_of_few_trials_is_judged_as_by_all_their_orders(swapped: tuple
     drawn = residual.PERMUTATIONS if p < residual.ORDER_LEVEL else residual.AT_ONCE
     assert abs(p - exact) < 2 * np.sqrt(exact / drawn) + 1 / drawn
     assert spearmanr(one, other).pvalue < residual.LIKELY
+
+
+@pytest.mark.parametrize(
+    ("other", "contradicts"),
+    [
+        ({}, []),
+        ({"R_goal": 0.59, "mean": 2.4}, []),
+        ({"P_complete": 0.98}, ["P_complete is 0.5"]),
+        ({"mean": 2.6}, ["mean is 2 "]),
+        ({"mean": None}, []),
+    ],
+)
+@pytest.mark.parametrize(
+    "untested", [{"same": False}, {"what_if": ["a.mean*=2"]}, {"asked": ["a"]}]
+)
+def test_two_views_that_contradict_each_other_are_doubtful_where_no_trial_tells(
+    other: dict[str, Any], contradicts: list[str], untested: dict[str, Any]
+) -> None:
+    values = {"R_goal": 0.5, "P_complete": 0.5, "mean": 2.0}
+    figures = {
+        name: {"value": value, "confidence": [0.95 * value, 1.05 * value]}
+        for name, value in values.items()
+    }
+    said = {"from": "net", "whole": True, "same": True, "asked": [], "figures": figures}
+    found = contradictions(said | untested, values | other)
+    assert len(found) == len(contradicts)
+    for text, words in zip(found, contradicts, strict=True):
+        assert words in text
+    assert not contradictions(said, values | other), "the trials tell"
+    assert not contradictions(said | untested, {"why": "not solved"})
