@@ -45,7 +45,7 @@ export class Canvas {
   fold(folded) {
     this.view.fold(folded);
     this.errors.setAttribute("aria-pressed", String(!folded));
-    this.view.fit();
+    this.view.fit(this.view.least);
     this.map.draw(this.view);
     this.folded?.(folded);
   }

@@ -3,6 +3,7 @@
 import { fill, s } from "../dom.js";
 import { snap } from "../geometry.js";
 import { automatic } from "../layout.js";
+import { READABLE } from "../net_view.js";
 
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 const span = (elements, axis) => Math.max(...elements.map((e) => e[axis])) - Math.min(...elements.map((e) => e[axis]));
@@ -42,7 +43,7 @@ export function layOut(designer) {
   const positions = automatic(part);
   designer.model.move(some ? about(positions, movable(designer)) : positions);
   designer.view.reroute(new Set(), true);
-  if (!some) designer.view.fit();
+  if (!some) designer.view.fit(READABLE);
 }
 
 /** Positions moved as a whole so that their middle is where that of the elements is. */
