@@ -887,7 +887,7 @@ async def test_a_long_net_begins_where_it_can_be_read_and_shows_what_is_held(
     (tasks / "long.toml").write_text(HOLDING + held + "".join(steps))
     tab, complaints = await designing(browser, page, "long")
     zoom = "() => petrobot.tabs.Design.view.view.zoom"
-    assert await tab.evaluate(zoom) >= 0.7
+    assert await tab.evaluate(zoom) >= 0.6
     await expect(element(tab, "^Plain place jobs, 1 token")).to_be_in_viewport(ratio=1.0)
     cell = tab.locator(".designer [data-arc*='|cell|']")
     await expect(cell).to_have_count(2)

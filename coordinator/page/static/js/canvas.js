@@ -80,6 +80,14 @@ export class Canvas {
     keep(event);
   }
 
+  /** Until the user moves or zooms: keep what is active in sight. */
+  follow() {
+    const { active: [first], fitted, least, size, view } = this.view;
+    if (view !== fitted || !least || !size || !first) return;
+    const inSight = ["x", "y"].every((axis, i) => first[axis] * view.zoom + view[axis] > 0 && first[axis] * view.zoom + view[axis] < size[i]);
+    if (!inSight) this.view.fit(least);
+  }
+
   goTo(name) {
     const element = this.view.elements.get(name);
     if (!element) return false;

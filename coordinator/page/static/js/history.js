@@ -3,9 +3,9 @@
 import { Canvas, tool } from "./canvas.js";
 import { attribute, fill, h, Press, seconds, text, words } from "./dom.js";
 import { listRuns, openRun } from "./files.js";
+import { READABLE } from "./geometry.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
-import { READABLE } from "./net_view.js";
 import { simulateDialog } from "./start.js";
 import { alarms, drawnOn, labelsOf, sheetOf, tokensOf, trailOf } from "./sheet.js";
 

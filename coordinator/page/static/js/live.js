@@ -4,9 +4,9 @@ import { Cameras, Devices } from "./camera.js";
 import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
 import { attribute, fill, h, Press, rows, seconds, text, valueText, words } from "./dom.js";
+import { READABLE } from "./geometry.js";
 import { icon } from "./icons.js";
 import { Learning, objectives } from "./learning.js";
-import { READABLE } from "./net_view.js";
 import { Selected } from "./selected.js";
 import { Selectors } from "./selectors.js";
 import { alarms, drawnOn, labelsOf, runsOn, sheetOf, tokensOf, trailOf } from "./sheet.js";
@@ -97,7 +97,7 @@ export class Live {
   paintText() {
     const changed = this.stale;
     if (!changed.size) return;
-    this.view.follow();
+    this.canvas.follow();
     this.stale = new Set();
     const dirty = (...parts) => changed.has("all") || parts.some((part) => changed.has(part));
     if (dirty("firings", "breakpoints", "marking")) this.paintMarks();

@@ -1,16 +1,13 @@
 // Draws one net as SVG and alters only what changed. Shared by the live view, the designer and the history.
 
 import { attribute, s, text, words } from "./dom.js";
-import { at, BAR_H, BAR_W, bounds, labelAt, path, pips, PLACE_R, route } from "./geometry.js";
+import { at, BAR_H, BAR_W, bounds, fitting, labelAt, path, pips, PLACE_R, route, ZOOM } from "./geometry.js";
 import { Flights } from "./flights.js";
 import { iconPath } from "./icons.js";
 import { Ground } from "./labels.js";
 
 const KIND_WORD = { action: "Action place", resource: "Resource place", control: "Control place", macro: "Macro place", plain: "Plain place" };
 const LABEL_MOST = 24;
-const ZOOM = [0.12, 3];
-/** Zoom at which the smallest names are still readable; a net that is too large for it begins at its active part. */
-export const READABLE = 0.7;
 const FLASH_MS = 550;
 
 const tokens = (n) => (n === 1 ? "1 token" : `${n} tokens`);
@@ -27,7 +24,6 @@ export class NetView {
     this.arcs = new Map();
     this.folded = true;
     this.view = { x: 0, y: 0, zoom: 1 };
-    this.least = 0; // zoom of the last fit, at the least
     this.layers = Object.fromEntries(["arcs", "nodes", "over", "live", "flights"].map((n) => [n, s("g", { class: n })]));
     const { arcs, nodes, over, live, flights } = this.layers;
     this.worlds = [[arcs, nodes, over], [live], [flights]].map((layers) => s("g", { class: "world" }, layers));
@@ -418,16 +414,7 @@ export class NetView {
     this.least = least;
     if (!w || !h) this.fitted = this.view; // on a tab that is not shown: fitted when it is
     if (!box || !w || !h) return;
-    const top = 46; // the bar lies over the drawing
-    const whole = Math.min(1.5, (w - 24) / (box[2] - box[0]), (h - top - 12) / (box[3] - box[1]));
-    const zoom = Math.max(ZOOM[0], least, whole);
-    const at = zoom > whole && this.active[0] ? [this.active[0].x, this.active[0].y] : [0, 1].map((i) => (box[i] + box[i + 2]) / 2);
-    // in the middle, but with no empty margin where the drawing goes on at the other side
-    const from = (i, room) => {
-      const [first, last] = [12 - box[i] * zoom, room - 12 - box[i + 2] * zoom];
-      return first < last ? (first + last) / 2 : Math.min(first, Math.max(last, room / 2 - at[i] * zoom));
-    };
-    this.look(from(0, w), top + from(1, h - top), zoom);
+    this.look(...fitting(box, w, h, least, this.active[0]));
     this.fitted = this.view;
   }
 
@@ -435,15 +422,6 @@ export class NetView {
   get active() {
     const rank = (e) => (e.live.dataset.run ? 0 : e.kind === "resource" ? 2 : 1);
     return [...this.elements.values()].filter((e) => e.tokens && !this.isFolded(e)).sort((a, b) => rank(a) - rank(b));
-  }
-
-  /** Until the user moves or zooms: keep what is active in sight. */
-  follow() {
-    if (this.view !== this.fitted || !this.least || !this.size) return;
-    const { x, y, zoom } = this.view;
-    const [first] = this.active;
-    const inSight = (e) => e.x * zoom + x > 0 && e.x * zoom + x < this.size[0] && e.y * zoom + y > 0 && e.y * zoom + y < this.size[1];
-    if (first && !inSight(first)) this.fit(this.least);
   }
 
   look(x, y, zoom) {

@@ -1,9 +1,8 @@
 // Arranging: align, space evenly, automatic layout; and lines that show with which elements a dragged one is aligned.
 
 import { fill, s } from "../dom.js";
-import { snap } from "../geometry.js";
+import { READABLE, snap } from "../geometry.js";
 import { automatic } from "../layout.js";
-import { READABLE } from "../net_view.js";
 
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
 const span = (elements, axis) => Math.max(...elements.map((e) => e[axis])) - Math.min(...elements.map((e) => e[axis]));

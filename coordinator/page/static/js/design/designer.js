@@ -3,8 +3,8 @@
 import { Canvas } from "../canvas.js";
 import { attribute, h, words } from "../dom.js";
 import { loadOffers } from "../files.js";
+import { READABLE } from "../geometry.js";
 import { placed } from "../layout.js";
-import { READABLE } from "../net_view.js";
 import { toast } from "../toast.js";
 import { guides } from "./arrange.js";
 import { Bar } from "./bar.js";

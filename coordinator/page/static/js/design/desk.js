@@ -3,7 +3,7 @@
 import { askDialog } from "../dialog.js";
 import { h } from "../dom.js";
 import { askName, exportAs, importNet, listTasks, openTask, revisionOf, saveTask } from "../files.js";
-import { READABLE } from "../net_view.js";
+import { READABLE } from "../geometry.js";
 import { toast } from "../toast.js";
 import { emptyDocument } from "./model.js";
 
