@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.coordinator.run.supervisor import is_local
-from petrobot.services.comm.calls.caller import Caller, Notice, PeerLost
+from petrobot.services.comm.calls.caller import Caller, Notice, Patience, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
@@ -41,6 +41,9 @@ answer is not known to stand still; but its node has cleared the stop before it 
 continues or starts without one."""
 NODE_LATE = 0.15
 """Wait for a node's answer before its bus is stopped instead (s)."""
+STORED = 10.0
+"""Wait for a connected node's answer (s). It has stopped its devices by then, but answers once that
+is on its disk, and some disks need seconds."""
 STANDSTILL = 1.5
 """Time for devices to come to rest before their last answer is reported as it is (s)."""
 ASK_AGAIN = 0.02
@@ -116,7 +119,10 @@ class EmergencyLine:
         name = f"estop-{secrets.token_hex(4)}"
         entry = directory.nodes[node]
         caller = Caller(
-            node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name), auto_ack=True
+            node,
+            Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name),
+            patience=Patience(answer=STORED),
+            auto_ack=True,
         )
         self.node = node
         self.why = ""
@@ -248,11 +254,12 @@ async def _ask(line: EmergencyLine | None, stopped: Stopped, verb: str) -> None:
     begun = loop.time()
     if await line.connect(STANDSTILL):
         while True:
-            answers = await line.order(verb, STANDSTILL)
+            answers = await line.order(verb, STORED)
             if answers is None:
                 break
             if stopped.seconds is None:
                 stopped.seconds = loop.time() - begun
+                begun = loop.time()  # its devices may have stopped while it wrote
             stopped.devices, stopped.note = line.devices_of(answers), line.note or stopped.note
             stopped.open = [d for d, said in stopped.devices.items() if said not in _DONE[verb]]
             if "stopping" not in stopped.devices.values() or loop.time() - begun > STANDSTILL:

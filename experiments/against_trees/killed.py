@@ -33,6 +33,7 @@ from experiments.against_trees.results import PLANT, ROOT, TASK, Line, Results, 
 from experiments.against_trees.tree import TreeProgram
 from experiments.against_trees.verified import environment
 from petrobot.services.comm.location_file import load
+from tests.ports import free_ports
 
 PROGRAMS = ("net", "tree", "tree and file")
 BALLS = 3
@@ -88,17 +89,9 @@ async def run_tree(services: Path, kept: Path | None) -> None:
 # --- one kill -------------------------------------------------------------------------------------
 
 
-def _free_ports(count: int) -> list[int]:
-    bound = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [int(one.getsockname()[1]) for one in bound]
-    for one in bound:
-        one.close()
-    return ports
-
-
 def _write_cell(folder: Path) -> Path:
     """Write the location file of a plant without faults that logs to a file."""
-    vision, motion = _free_ports(2)
+    vision, motion = free_ports(2)
     log = json.dumps(str(folder / "plant.log"))
     edits = [Edit("7331", str(vision)), Edit("7332", str(motion))]
     edits += [

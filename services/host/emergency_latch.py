@@ -59,6 +59,8 @@ class Latch:
 
     def __init__(self, node: str, folders: Iterable[Path]) -> None:
         self.paths = tuple(folder / f"{node}.stopped" for folder in folders)
+        self._stored: tuple[Path, frozenset[str]] | None = None
+        """What this object has stored last, synced to disk."""
 
     def stopped(self) -> frozenset[str]:
         """Return the names of the stopped devices; with `ALL` among them, all are stopped.
@@ -70,7 +72,13 @@ class Latch:
     def stop(self, devices: Iterable[str]) -> Path:
         """Add devices to the stopped ones. Return the file, once it is safe on disk. Raises
         LatchError."""
-        return self._write(".stopped", sorted(self.stopped() | set(devices)))
+        names = self.stopped() | set(devices)
+        # An operator's command repeats its order until the devices stand still.
+        if self._stored is not None and self._stored[1] == names == _read(self._stored[0]):
+            return self._stored[0]
+        path = self._write(".stopped", sorted(names))
+        self._stored = path, names
+        return path
 
     def moved_here(self, devices: Iterable[str]) -> set[str]:
         """Return which of these devices another node on this host has stopped: services.toml gave

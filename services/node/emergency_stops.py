@@ -7,8 +7,7 @@ or whose loop is blocked, can stop nothing.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from petrobot.services.host.emergency_latch import ALL, Cleared, Latch, LatchError, uptime
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
@@ -68,16 +67,40 @@ class Guard:
         return NODE_SILENT if now - self._heard >= SILENCE else ""
 
 
+Write = Callable[[Callable[[], str], Callable[[str], None]], None]
+"""Runs the first function away from the event loop, one after the other in their order, and passes
+what it returns to the second, in the loop."""
+
+
+def write_at_once(write: Callable[[], str], done: Callable[[str], None]) -> None:
+    """Write here and now: for a process without an event loop."""
+    done(write())
+
+
 class EmergencyStops:
     """The devices of a node that are in emergency stop. Without a latch (lock step) they are
-    forgotten with the process."""
+    forgotten with the process.
 
-    def __init__(self, devices: Iterable[str], latch: Latch | None = None) -> None:
+    A disk may need seconds for one sync, in which the node must answer its callers and its
+    processes. So `in_order` writes, and what was ordered is reported by `done`, once it is on disk.
+    """
+
+    def __init__(
+        self,
+        devices: Iterable[str],
+        latch: Latch | None = None,
+        in_order: Write = write_at_once,
+    ) -> None:
         self.due = 0.0 if latch is not None else NEVER
         """When to look next (s)."""
         self._devices = tuple(devices)
         self._latch = latch
         self._stopped: set[str] = set()
+        self._in_order = in_order
+        self._writing = 0
+        """Number of writes that have not ended."""
+        self._clearing: list[set[str]] = []
+        """For each clearing that has not ended, its devices without those stopped since."""
         self.cleared, self._cleared_at, _ = Cleared() if latch is None else latch.cleared
         """How many stops were cleared, and when the last one was. A caller that knows of fewer
         slept through one."""
@@ -102,7 +125,7 @@ class EmergencyStops:
         the latch cannot be kept, because then one may have been lost."""
         unsure = self._latch is not None and not self._latch.kept
         if self._latch is not None and (moved := self._latch.moved_here(self._devices)):
-            self.stop(moved)
+            self.stop(moved, lambda why: None)
             return sorted(self._stopped.union(self.look(0.0)[0]))
         return self._add(self._devices) if unsure else self.look(0.0)[0]
 
@@ -115,11 +138,15 @@ class EmergencyStops:
             return [], []
         self.due = now + LOOK if self._devices else NEVER
         cleared = self._latch.cleared  # before the devices: that is the order of clearing
-        self._count(cleared)
         stopped = self._latch.stopped()
         # A name that this node does not have means all: `ALL`, or a device renamed while stopped.
         unknown = not stopped <= set(self._devices)
         on_disk = [d for d in self._devices if d in stopped or unknown]
+        if (
+            self._writing
+        ):  # a file that lacks a device may be one that this node has not yet written
+            return self._add(on_disk), []
+        self._count(cleared)
         last = cleared.devices
         freed = [d for d, n in self._counted.items() if last.get(d, 0) > n and d not in on_disk]
         self._stopped.difference_update(freed)
@@ -132,42 +159,76 @@ class EmergencyStops:
     def _store_again(self, latch: Latch, devices: Collection[str]) -> None:
         """Store a stop that the disk had no room for, or whose file was removed: this node knows of
         it, and its successor must."""
-        with suppress(LatchError):  # reported when it was given; tried again at the next look
-            path = latch.stop(devices)
-            names = ", ".join(sorted(devices))
-            _log.warning("%s: stored again that %s stopped in emergency", path, names)
 
-    def stop(self, devices: Collection[str]) -> str:
-        """Stop these devices. Return why that could not be stored on disk; empty if it was."""
+        def done(why: str) -> None:
+            if not why:  # else it was reported when it was given, and the next look tries again
+                names = ", ".join(sorted(devices))
+                _log.warning("stored again that %s stopped in emergency", names)
+
+        self._write(lambda: latch.stop(devices), done)
+
+    def stop(self, devices: Collection[str], done: Callable[[str], None]) -> None:
+        """Stop these devices. `done` receives why that could not be stored on disk; empty if it
+        was."""
         self._add(devices)
-        if self._latch is not None:  # a clearing that has already begun does not mean this stop
-            self._counted |= dict.fromkeys(devices, self._latch.cleared.number)
-        try:
-            if self._latch is not None and devices:
-                self._latch.stop(devices)
-        except LatchError as fault:
-            _log.error("an emergency stop could not be stored: %s", fault)
-            return (
-                f"NOT STORED: {fault}; the node tries again; if it ends before, the devices may "
-                "move: do not start it again before the cell is safe"
-            )
-        return ""
+        for clearing in self._clearing:
+            clearing.difference_update(devices)
+        if self._latch is None or not devices:
+            done("")
+            return
+        # A clearing that has already begun does not mean this stop.
+        self._counted |= dict.fromkeys(devices, self._latch.cleared.number)
+        latch, stopped = self._latch, tuple(devices)
 
-    def clear(self, devices: Sequence[str]) -> str:
-        """Let these devices accept commands again. Return why not; empty if they do. What is still
-        stopped on disk stays stopped."""
-        try:
-            if self._latch is not None:
-                self._latch.clear(devices, self._devices)
-        except LatchError as fault:
-            return str(fault)
-        if not self._stopped.isdisjoint(devices):
-            self._count(Cleared(self.cleared + 1, uptime()))
-        if self._latch is not None:
-            self._count(self._latch.cleared)
-        self._stopped.difference_update(devices)
-        self._counted = dict.fromkeys(self._devices, self.cleared)
-        return ""
+        def stored(why: str) -> None:
+            if why:
+                _log.error("an emergency stop could not be stored: %s", why)
+                why = (
+                    f"NOT STORED: {why}; the node tries again; if it ends before, the devices may "
+                    "move: do not start it again before the cell is safe"
+                )
+            done(why)
+
+        self._write(lambda: latch.stop(stopped), stored)
+
+    def clear(self, devices: Sequence[str], done: Callable[[str], None]) -> None:
+        """Let these devices accept commands again. `done` receives why not; empty if they do. What
+        is still stopped on disk stays stopped, and so does what is stopped until `done`."""
+        latch, freed = self._latch, set(devices)
+        self._clearing.append(freed)
+
+        def cleared(why: str) -> None:
+            self._clearing = [one for one in self._clearing if one is not freed]
+            if not why:
+                if not self._stopped.isdisjoint(devices):
+                    self._count(Cleared(self.cleared + 1, uptime()))
+                if latch is not None:
+                    self._count(latch.cleared)
+                self._stopped.difference_update(freed)
+                self._counted = dict.fromkeys(self._devices, self.cleared)
+            done(why)
+
+        if latch is None:
+            cleared("")
+        else:
+            self._write(lambda: latch.clear(devices, self._devices), cleared)
+
+    def _write(self, write: Callable[[], object], done: Callable[[str], None]) -> None:
+        """Write in turn; `done` receives why that failed, or an empty text."""
+
+        def attempt() -> str:
+            try:
+                write()
+            except LatchError as fault:
+                return str(fault)
+            return ""
+
+        def ended(why: str) -> None:
+            self._writing -= 1
+            done(why)
+
+        self._writing += 1
+        self._in_order(attempt, ended)
 
     def _count(self, found: Cleared) -> None:
         self.cleared, self._cleared_at = max((self.cleared, self._cleared_at), found[:2])

@@ -51,7 +51,7 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.device import PICTURE
 from petrobot.services.host.emergency_latch import Latch
-from petrobot.services.node.emergency_stops import NEVER, EmergencyStops
+from petrobot.services.node.emergency_stops import NEVER, EmergencyStops, Write, write_at_once
 from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.memory import GlobalMemory, event_name
 from petrobot.services.worker.callables import (
@@ -185,6 +185,8 @@ class _Commanded:
     data: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     """A remark for the operator."""
+    storing: bool = False
+    """Whether it is being written to disk: only then it is answered, however long that takes."""
 
 
 class Node:
@@ -207,10 +209,11 @@ class Node:
         connect: Callable[[str], None] | None = None,
         stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
         latch: Latch | None = None,
+        in_order: Write = write_at_once,
     ) -> None:
         """`connect(peer)` is called before the first call to a peer; `stream_address(stream)` gives
         the address at which this node receives a set-point stream; `latch` keeps an emergency stop
-        over a restart."""
+        over a restart, and `in_order` writes it."""
         self.directory = directory
         self.name = name
         self.boot = boot
@@ -244,9 +247,12 @@ class Node:
             {t.name: t.period for t in directory.timers.values() if t.node == name}
         )
         self._now = 0.0
+        self._clock = clock
         self._commands: dict[str, _Commanded] = {}
         self._stops = EmergencyStops(
-            [key for key in self.places if key not in (LOOP, GENERAL)], latch
+            [key for key in self.places if key not in (LOOP, GENERAL)],
+            latch,
+            in_order,
         )
         self._stop_places(0.0, self._stops.at_start())
         self.callee.stops = self._stops.cleared
@@ -372,7 +378,8 @@ class Node:
         # A plain loop: lists of times cost as much as the rest.
         soonest = self._stops.due
         for command in self._commands.values():
-            soonest = min(soonest, command.due)
+            if not command.storing:
+                soonest = min(soonest, command.due)
         due = self._timers.due()
         if due is not None and due < soonest:
             soonest = due
@@ -451,20 +458,38 @@ class Node:
         else:
             if command.verb == CLEAR_EMERGENCY:
                 self._look_for_stops(now)  # what is cleared unseen would end no run
-                why = self._stops.clear(keys)
-                self.callee.stops = self._stops.cleared
-                if why:
-                    note = f"NOT CLEARED: {why}; its devices stay stopped"
-                    self.callee.answer(now, command.id, False, {"answers": {}, "note": note})
-                    return
-            self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
-            for key in keys:
-                self.places[key].command(now, command)
+                self._stops.clear(keys, lambda why: self._cleared(command, keys, why))
+                return
+            self._pass_on(now, command, keys)
             devices = [key for key in keys if key != GENERAL]
             if command.verb == EMERGENCY_STOP and devices:
                 # the devices first, the disk then; both before the answer
-                self._commands[command.id].note = self._stops.stop(devices)
+                self._commands[command.id].storing = True
+                self._stops.stop(devices, lambda why: self._stored(command.id, why))
                 self.callee.tell_coordinators(STOP_EVENT)
+
+    def _pass_on(self, now: float, command: Command, keys: Iterable[str], note: str = "") -> None:
+        """Give a command to these hosts; it is answered when they have, or with the time."""
+        due = now + ANSWER_WITHIN
+        self._commands[command.id] = _Commanded(command.verb, due, set(keys), note=note)
+        for key in keys:
+            self.places[key].command(now, command)
+
+    def _stored(self, id_: str, why: str) -> None:
+        """An emergency stop is on disk, or cannot be stored."""
+        self._commands[id_].storing, self._commands[id_].note = False, why
+
+    def _cleared(self, command: Command, keys: Iterable[str], why: str) -> None:
+        """An emergency stop is cleared on disk, or cannot be."""
+        now = self._clock()
+        self.callee.stops = self._stops.cleared
+        if why:
+            note = f"NOT CLEARED: {why}; its devices stay stopped"
+            self.callee.answer(now, command.id, False, {"answers": {}, "note": note})
+            return
+        again = ", ".join(key for key in keys if key in self._stops)
+        note = f"NOT CLEARED: {again}: another emergency stop was given meanwhile" if again else ""
+        self._pass_on(now, command, [key for key in keys if key not in self._stops], note)
 
     def _refused_lease(self, now: float, id_: str, device: str) -> tuple[str, str] | None:
         """Give a device to the caller of a command. Return why not: cause and text; None if it has
@@ -504,7 +529,7 @@ class Node:
         if not self._commands:
             return
         for id_, command in list(self._commands.items()):
-            if not command.missing or now >= command.due:
+            if not command.storing and (not command.missing or now >= command.due):
                 del self._commands[id_]
                 answers = {
                     **command.answers,

@@ -8,7 +8,8 @@ import logging
 import os
 import secrets
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -67,6 +68,7 @@ class NodeShell:
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Host] = {**self._workers}
         self.latch = latch_of(directory.source, name)
+        self._disk = ThreadPoolExecutor(1, "disk")
         self.node = Node(
             directory,
             name,
@@ -76,6 +78,7 @@ class NodeShell:
             connect=self._connect,
             stream_address=self._stream_address,
             latch=self.latch,
+            in_order=self._write,
         )
         self.node.scripted = bool(mock)
         self.node.code = {m: digest for m, (_, digest) in sources(directory, name).items()}
@@ -216,6 +219,16 @@ class NodeShell:
         for client in self._clients.values():
             client.flush(now)
         self._alarm.set(self.node.due())
+
+    def _write(self, write: Callable[[], str], done: Callable[[str], None]) -> None:
+        """Write to disk, in a thread, what an operator's command needs there: one sync may take
+        seconds."""
+
+        def ended(future: asyncio.Future[str]) -> None:
+            done(future.result())
+            self._changed()
+
+        self._loop.run_in_executor(self._disk, write).add_done_callback(ended)
 
     # --- other nodes --------------------------------------------------------------------------
 

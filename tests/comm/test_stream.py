@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import count
 
 import msgpack
 import pytest
@@ -191,6 +192,23 @@ def test_a_sender_connects_again_to_a_receiver_that_returns(
     )
     wait_for(lambda: sink.got[-1] is not None, lambda: sender.send((3.0,)), again.poll)
     again.close()
+
+
+def test_a_sender_whose_receiver_is_never_heard_connects_again() -> None:
+    """As when a tunnel loses one direction, the receiver's answer and the end of the connection."""
+    times = count(0.0, 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        silent.settimeout(60.0)
+        sender = StreamSender(
+            *("vision", "catch_point", 0.04, *silent.getsockname()),
+            receiver="motion",
+            clock=lambda: next(times),
+        )
+        for _ in range(20):
+            assert not sender.send((1.0,))
+        for _ in range(2):
+            silent.accept()[0].close()
+        sender.close()
 
 
 def test_the_newest_sender_of_a_stream_takes_it_over(

@@ -35,6 +35,9 @@ SERVICES = """\
 [services.block]
 node = "only"
 run = "toy_cell.actions:block"
+[services.slow_disk]
+node = "only"
+run = "toy_cell.actions:slow_disk"
 """
 DEVICE = """\
 [devices.the_{name}]
@@ -193,6 +196,31 @@ async def test_the_emergency_stop_of_a_frozen_node(moved: Moved, operator: Opera
     assert await asyncio.to_thread(main, ["estop", "--clear", *services]) == 0
     await usable(operator, "base")
     await usable(operator, "tool")
+
+
+@pytest.mark.processes
+async def test_the_emergency_stop_of_a_node_with_a_slow_disk(
+    moved: Moved, operator: Operator
+) -> None:
+    """It stops its device at once, answers its callers while it writes, and acknowledges stop and
+    clearing once they are stored."""
+    run = await moving(moved, operator, "base")
+    services, path = (
+        ["--services", str(moved.node.file)],
+        latch_of(moved.node.file, "only").paths[0],
+    )
+    await operator.call("slow_disk", None, seconds=1.5)  # longer than a connection may be silent
+    try:
+        ordered = asyncio.create_task(asyncio.to_thread(main, ["estop", *services]))
+        await asyncio.to_thread(moved.stopped, "base")
+        assert not ordered.done(), "it is not stored yet"
+        assert await ordered == 0 and path.exists()
+        assert (await run).cause == "emergency_stop"
+        assert await asyncio.to_thread(main, ["estop", "--clear", *services]) == 0
+        assert not path.exists()
+    finally:
+        await operator.call("slow_disk", None, seconds=0.0)
+    await usable(operator, "base")
 
 
 @pytest.mark.processes

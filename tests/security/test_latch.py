@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,20 @@ from petrobot.services.host.emergency_latch import ALL, STATE, Latch, LatchError
 from petrobot.services.node.emergency_stops import LOOK, NEVER, EmergencyStops
 
 DEVICES = ("arm", "camera", "gripper")
+
+
+def stop(stops: EmergencyStops, devices: Iterable[str]) -> str:
+    """Stop these devices; return what `done` received, at once."""
+    why: list[str] = []
+    stops.stop(list(devices), why.append)
+    return why[0]
+
+
+def clear(stops: EmergencyStops, devices: Sequence[str]) -> str:
+    """Clear these devices; return what `done` received, at once."""
+    why: list[str] = []
+    stops.clear(devices, why.append)
+    return why[0]
 
 
 def latch(folder: Path) -> Latch:
@@ -84,13 +99,13 @@ def test_a_stop_that_cannot_be_stored_is_reported_and_still_holds(tmp_path: Path
     with pytest.raises(LatchError, match="Not a directory"):
         nowhere.stop(["arm"])
     stops = EmergencyStops(DEVICES, nowhere)
-    assert "NOT STORED" in stops.stop(["arm"]) and "arm" in stops
+    assert "NOT STORED" in stop(stops, ["arm"]) and "arm" in stops
     stuck = latch(tmp_path)
     stuck.paths[0].mkdir(parents=True)
     stops = EmergencyStops(DEVICES, stuck)
     stops.at_start()
     assert (
-        "remove this file by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
+        "remove this file by hand once the cell is safe" in clear(stops, ["arm"]) and "arm" in stops
     )
 
 
@@ -104,16 +119,16 @@ def test_a_stop_whose_file_is_gone_or_never_was_is_stored_again(
 
     one = latch(tmp_path)
     stops = EmergencyStops(DEVICES, one)
-    stops.stop(["arm"])
+    stop(stops, ["arm"])
     for folder in tmp_path.iterdir():
         shutil.rmtree(folder)
     assert one.stopped() == frozenset()
     assert stops.look(1.0) == ([], []) and latch(tmp_path).stopped() == {"arm"}
-    assert stops.clear(["arm"]) == "" and stops.look(2.0) == ([], [])
+    assert clear(stops, ["arm"]) == "" and stops.look(2.0) == ([], [])
     assert one.stopped() == frozenset() and one.cleared.number == 1
     with monkeypatch.context() as full:
         full.setattr("petrobot.services.host.emergency_latch.write_whole", no_room)
-        assert "the node tries again" in stops.stop(["arm"])
+        assert "the node tries again" in stop(stops, ["arm"])
         assert stops.look(3.0) == ([], []) and one.stopped() == frozenset()
     assert stops.look(4.0) == ([], []) and one.stopped() == {"arm"}
 
@@ -126,7 +141,7 @@ def test_a_node_that_cannot_store_a_latch_starts_stopped(
     monkeypatch.setattr("petrobot.services.host.emergency_latch._writable", lambda folder: False)
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == list(DEVICES)
-    assert stops.clear(DEVICES) == "" and stops.names == (), (
+    assert clear(stops, DEVICES) == "" and stops.names == (), (
         "an operator may say so for this life of it"
     )
 
@@ -162,9 +177,9 @@ def test_cleared_stops_are_counted_and_the_count_stays(tmp_path: Path) -> None:
     """In memory and on disk alike: whoever clears a stop, its node knows how many there were, even
     if it was frozen or is another process. Where nothing was stopped, nothing is counted."""
     stops = EmergencyStops(DEVICES, latch(tmp_path))
-    assert stops.clear(DEVICES) == "" and stops.cleared == 0
-    stops.stop(["arm"])
-    assert stops.clear(["arm"]) == "" and stops.clear(["arm"]) == "" and stops.cleared == 1
+    assert clear(stops, DEVICES) == "" and stops.cleared == 0
+    stop(stops, ["arm"])
+    assert clear(stops, ["arm"]) == "" and clear(stops, ["arm"]) == "" and stops.cleared == 1
     latch(tmp_path).stop([ALL])
     latch(tmp_path).clear(DEVICES, DEVICES)
     assert stops.look(1.0) == ([], list(DEVICES)) and stops.cleared == 2
@@ -176,7 +191,7 @@ def test_a_stop_that_another_process_has_cleared_is_cleared(tmp_path: Path) -> N
     """Also one that only the processes of the devices have seen, but none of another device, none
     that was given while it was being cleared, and none whose file is only gone."""
     stops, other = EmergencyStops(DEVICES, latch(tmp_path)), latch(tmp_path)
-    stops.stop(DEVICES)
+    stop(stops, DEVICES)
     other.clear(["arm"], DEVICES)
     assert stops.look(1.0) == ([], ["arm"]) and [*stops.names] == ["camera", "gripper"]
     other.clear(DEVICES, DEVICES)
@@ -189,7 +204,7 @@ def test_a_stop_that_another_process_has_cleared_is_cleared(tmp_path: Path) -> N
     # As far as the other process has come:
     counted.write_text("\n".join(["5", "1.0", *(f"{device} 5" for device in DEVICES), ""]))
     assert other.cleared == (5, 1.0, dict.fromkeys(DEVICES, 5))
-    stops.stop(DEVICES)
+    stop(stops, DEVICES)
     for path in other.paths:
         path.unlink(missing_ok=True)
     assert stops.look(5.0) == ([], []) and [*stops.names] == [*DEVICES]
@@ -233,12 +248,12 @@ def test_a_stop_that_cannot_be_counted_is_not_cleared(tmp_path: Path) -> None:
 
 def test_a_device_that_is_renamed_while_it_is_stopped_stays_stopped(tmp_path: Path) -> None:
     """A name that the node does not have means all its devices, until they are cleared."""
-    EmergencyStops(["arm", "eye"], latch(tmp_path)).stop(["arm"])
+    stop(EmergencyStops(["arm", "eye"], latch(tmp_path)), ["arm"])
     renamed = EmergencyStops(["puma", "eye"], latch(tmp_path))
     assert sorted(renamed.at_start()) == ["eye", "puma"]
-    assert renamed.clear(["eye"]) == "" and renamed.names == ("puma",)
+    assert clear(renamed, ["eye"]) == "" and renamed.names == ("puma",)
     assert latch(tmp_path).stopped() == {"puma"}, "known by its new name from now on"
-    assert renamed.clear(["puma"]) == "" and latch(tmp_path).stopped() == frozenset()
+    assert clear(renamed, ["puma"]) == "" and latch(tmp_path).stopped() == frozenset()
     assert EmergencyStops(["puma", "eye"], latch(tmp_path)).at_start() == []
 
 
@@ -249,12 +264,67 @@ def test_a_device_that_is_moved_to_another_node_while_it_is_stopped_stays_stoppe
     """On the same host. The command writes the file for a node that does not answer."""
     left, right = (Latch(node, [tmp_path / "first", tmp_path / "second"]) for node in ("l", "r"))
     if by == "node":
-        EmergencyStops(["arm", "eye"], left).stop(["arm", "eye"])
+        stop(EmergencyStops(["arm", "eye"], left), ["arm", "eye"])
     else:
         left.stop([ALL, "arm", "eye"])
     moved = EmergencyStops(["arm", "grip"], right)
     assert moved.at_start() == ["arm"] and right.stopped() == {"arm"}
     assert EmergencyStops(["lamp"], Latch("lamps", [tmp_path / "first"])).at_start() == []
-    assert moved.clear(["arm"]) == "" and moved.names == ()
+    assert clear(moved, ["arm"]) == "" and moved.names == ()
     assert "arm" not in left.stopped() and "eye" in left.stopped()
     assert EmergencyStops(["arm", "grip"], right).at_start() == []
+
+
+class SlowDisk:
+    """Writes when a test says so, as a thread of the node would, and reports it later still."""
+
+    def __init__(self) -> None:
+        self.waiting: list[tuple[Callable[[], str], Callable[[str], None]]] = []
+
+    def write(self, write: Callable[[], str], done: Callable[[str], None]) -> None:
+        self.waiting.append((write, done))
+
+    def go_on(self, meanwhile: Callable[[], object] = lambda: None) -> None:
+        """Write the oldest; do `meanwhile` before this is reported."""
+        write, done = self.waiting.pop(0)
+        why = write()
+        meanwhile()
+        done(why)
+
+
+def test_a_stop_acts_before_it_is_written_and_is_acknowledged_after(tmp_path: Path) -> None:
+    """On a slow disk, in order with the clearing before it, which it outlives; a look meanwhile
+    takes no file for the work of another process, but obeys a new stop."""
+    disk, said = SlowDisk(), list[str]()
+    stops = EmergencyStops(DEVICES, latch(tmp_path), disk.write)
+    stops.stop(["arm", "camera"], said.append)
+    assert [*stops.names] == ["arm", "camera"] and not said and not latch(tmp_path).stopped()
+    latch(tmp_path).stop(["gripper"])
+    assert stops.look(1.0) == (["gripper"], []) and len(disk.waiting) == 1
+    disk.go_on(lambda: stops.look(2.0))
+    assert said == [""] and latch(tmp_path).stopped() == set(DEVICES)
+
+    stops.clear(DEVICES, said.append)
+    assert [*stops.names] == [*DEVICES] and latch(tmp_path).stopped() == set(DEVICES)
+    stops.stop(["arm"], said.append)
+    disk.go_on(lambda: stops.look(3.0))
+    assert [*stops.names] == ["arm"] and stops.cleared == 1 and not latch(tmp_path).stopped()
+    assert stops.look(4.0) == ([], []) and len(disk.waiting) == 1
+    disk.go_on()
+    assert latch(tmp_path).stopped() == {"arm"} and said == ["", "", ""]
+    assert stops.look(5.0) == ([], []) and "arm" in stops and not disk.waiting
+
+
+def test_a_repeated_stop_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An operator's command repeats its order until the devices stand still. What another process
+    has replaced is written again."""
+    written = list[object]()
+    monkeypatch.setattr("os.fsync", written.append)
+    stops = EmergencyStops(DEVICES, latch(tmp_path))
+    assert [stop(stops, DEVICES) for _ in range(3)] == ["", "", ""]
+    once = len(written)
+    latch(tmp_path).paths[0].unlink()
+    assert stop(stops, DEVICES) == "" and len(written) > once
+    assert latch(tmp_path).stopped() == set(DEVICES)
+    twice = len(written)
+    assert stop(stops, ["arm"]) == "" and len(written) == twice

@@ -22,6 +22,7 @@ from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
 from petrobot.services.node.realtime import NodeShell
+from tests.ports import free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD = {
@@ -329,8 +330,7 @@ echo = {{ run = "tools.bench.wire_action:echo", task = "echo", node = "node" }}
     async def start(self) -> int:
         # where the worker finds the module of its action
         os.environ["PYTHONPATH"] = str(ROOT)
-        with socket.create_server((HOST, 0)) as probe:
-            port = int(probe.getsockname()[1])
+        port = free_ports(1)[0]
         text = self.PLACES.format(port=port)
         self.shell = NodeShell(parse(text, ROOT / "services.toml"), "node", text)
         await self.shell.start()

@@ -238,6 +238,8 @@ class StreamSender:
         self._line: StreamConnection | None = None
         self._greeted = False
         self._again = -math.inf
+        self._until = math.inf
+        """When the receiver must have welcomed the stream (s)."""
         self._opened = 0.0
         self._number = 0
         self._run: str | None = None
@@ -292,6 +294,8 @@ class StreamSender:
             for message in line.read():
                 self._take(line, message)
             line.write(b"")
+            if now >= self._until and not self.up:  # the answer was lost on the way, and its end
+                raise TimeoutError
         except OSError:
             self._drop(now + _RETRY)
         except ProtocolError as fault:
@@ -311,7 +315,7 @@ class StreamSender:
         host = self._address[0]
         sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
         self._line = StreamConnection(sock, Side.CLIENT, self._receiver, self._key)
-        self._greeted = False
+        self._greeted, self._until = False, now + _HANDSHAKE
         try:
             self._line.tune()
             sock.connect(self._address)

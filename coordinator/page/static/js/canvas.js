@@ -45,7 +45,7 @@ export class Canvas {
   fold(folded) {
     this.view.fold(folded);
     this.errors.setAttribute("aria-pressed", String(!folded));
-    this.view.fit();
+    this.view.fit(this.view.least);
     this.map.draw(this.view);
     this.folded?.(folded);
   }
@@ -78,6 +78,14 @@ export class Canvas {
       this.query.blur();
     }
     keep(event);
+  }
+
+  /** Until the user moves or zooms: keep what is active in sight. */
+  follow() {
+    const { active: [first], fitted, least, size, view } = this.view;
+    if (view !== fitted || !least || !size || !first) return;
+    const inSight = ["x", "y"].every((axis, i) => first[axis] * view.zoom + view[axis] > 0 && first[axis] * view.zoom + view[axis] < size[i]);
+    if (!inSight) this.view.fit(least);
   }
 
   goTo(name) {

@@ -2,6 +2,11 @@
 
 import { h, words } from "./dom.js";
 
+// steps between the ticks of what is counted
+const WHOLE = [0, 1, 2, 3, 4, 5, 6].flatMap((power) => [1, 2, 5].map((n) => n * 10 ** power));
+/** Room for the longest number beside the axis. */
+const wide = (_, values) => Math.max(42, 20 + 6.5 * Math.max(0, ...(values ?? []).map((value) => String(value ?? "").length)));
+
 const SERIES = ["accent", "ok", "warn", "hold", "bad", "muted"];
 
 export class Chart {
@@ -31,7 +36,8 @@ export class Chart {
     const colour = (name) => css.getPropertyValue(`--${name}`).trim();
     const axis = (label) => ({ label, stroke: colour("muted"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line"), width: 1 }, font: "11px system-ui", labelFont: "11px system-ui", labelSize: 18, size: 42 });
     const series = this.names.map((name, i) => ({ label: words(name), stroke: colour(SERIES[i % SERIES.length]), width: 1.8, points: { show: false } }));
-    const options = { ...this.measure(), scales: { x: { time: false } }, axes: [{ ...axis(this.axes[0]), size: 34 }, axis(this.axes[1])], series: [{ label: this.axes[0] }, ...series], cursor: { y: false }, legend: { live: true } };
+    const whole = this.columns[0].every(Number.isInteger);
+    const options = { ...this.measure(), scales: { x: { time: false } }, axes: [{ ...axis(this.axes[0]), size: 34, ...(whole && { incrs: WHOLE }) }, { ...axis(this.axes[1]), size: wide }], series: [{ label: this.axes[0] }, ...series], cursor: { y: false }, legend: { live: true } };
     this.plot = new uPlot(options, this.columns, this.box);
   }
 

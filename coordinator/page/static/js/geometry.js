@@ -124,3 +124,23 @@ export function labelAt(element, side) {
   if (side === "above") return [0, isPlace && element.sub ? -half - 24 : -half - 10, isPlace ? -half - 10 : -half - 24, "middle"];
   return [0, half + (isPlace ? 18 : 17), isPlace ? half + 32 : -half - 9, "middle"];
 }
+
+/** Least and most zoom of a view. */
+export const ZOOM = [0.12, 3];
+/** Zoom at which names can still be read. */
+export const READABLE = 0.6;
+const COMFORTABLE = 0.8;
+const TOP = 46; // the bar lies over the drawing
+const EDGE = 12;
+
+/** The view [x, y, zoom] of a drawing in a window of w by h: all of it, or where that would be smaller than `least`, the part around `active`. */
+export function fitting(box, w, h, least, active) {
+  const whole = Math.min(1.5, (w - 2 * EDGE) / (box[2] - box[0]), (h - TOP - EDGE) / (box[3] - box[1]));
+  const zoom = whole < least ? COMFORTABLE : Math.max(ZOOM[0], whole);
+  // in the middle, but with no empty margin where the drawing continues at the other side
+  const from = (i, room, at) => {
+    const [first, last] = [EDGE - box[i] * zoom, room - EDGE - box[i + 2] * zoom];
+    return first < last || at === undefined ? (first + last) / 2 : Math.min(first, Math.max(last, room / 2 - at * zoom));
+  };
+  return [from(0, w, active?.x), TOP + from(1, h - TOP, active?.y), zoom];
+}

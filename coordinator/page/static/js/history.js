@@ -3,6 +3,7 @@
 import { Canvas, tool } from "./canvas.js";
 import { attribute, fill, h, Press, seconds, text, words } from "./dom.js";
 import { listRuns, openRun } from "./files.js";
+import { READABLE } from "./geometry.js";
 import { icon } from "./icons.js";
 import { reasonText } from "./live.js";
 import { simulateDialog } from "./start.js";
@@ -67,13 +68,13 @@ class Screen {
     this.inside = "";
     text(this.tag, reel.run.id);
     this.draw();
-    this.canvas.view.fit();
+    this.canvas.view.fit(READABLE);
   }
 
   open(macro) {
     this.inside = macro;
     this.draw();
-    this.canvas.view.fit();
+    this.canvas.view.fit(READABLE);
   }
 
   draw() {
@@ -139,7 +140,7 @@ export class History {
     if (this.opening !== before) return;
     if (!this.reel) await this.open(this.runs[0]?.id ?? SESSION);
     else if (this.reel.run.id === SESSION) this.open(SESSION, true);
-    else for (const screen of this.screens) if (screen.reel) screen.canvas.view.fit();
+    else for (const screen of this.screens) if (screen.reel) screen.canvas.view.fit(READABLE);
   }
 
   controlsChanged() {
@@ -238,7 +239,7 @@ export class History {
     this.other = other;
     this.screens[1].canvas.root.hidden = !this.other;
     if (this.other) this.screens[1].load(this.other);
-    this.screens[0].canvas.view.fit();
+    this.screens[0].canvas.view.fit(READABLE);
     this.paintRuns();
     this.paintAbout();
     this.go(this.index, false);

@@ -4,6 +4,7 @@ import { Cameras, Devices } from "./camera.js";
 import { Canvas, panel } from "./canvas.js";
 import { Chart } from "./charts.js";
 import { attribute, fill, h, Press, rows, seconds, text, valueText, words } from "./dom.js";
+import { READABLE } from "./geometry.js";
 import { icon } from "./icons.js";
 import { Learning, objectives } from "./learning.js";
 import { Selected } from "./selected.js";
@@ -52,7 +53,7 @@ export class Live {
   open(macro) {
     this.inside = macro;
     this.draw();
-    this.view.fit();
+    this.view.fit(READABLE);
   }
 
   draw() {
@@ -82,7 +83,7 @@ export class Live {
       const first = this.taskKey !== key;
       this.taskKey = key;
       this.draw();
-      if (first) this.view.fit();
+      if (first) this.view.fit(READABLE);
     }
     for (const change of changes) if (change.kind === "fired") this.fired(change.firing);
     if (all || changed.has("marking") || changed.has("firings")) this.paintTokens();
@@ -96,6 +97,7 @@ export class Live {
   paintText() {
     const changed = this.stale;
     if (!changed.size) return;
+    this.canvas.follow();
     this.stale = new Set();
     const dirty = (...parts) => changed.has("all") || parts.some((part) => changed.has(part));
     if (dirty("firings", "breakpoints", "marking")) this.paintMarks();

@@ -1,14 +1,13 @@
 // Draws one net as SVG and alters only what changed. Shared by the live view, the designer and the history.
 
 import { attribute, s, text, words } from "./dom.js";
-import { at, BAR_H, BAR_W, bounds, labelAt, path, pips, PLACE_R, route } from "./geometry.js";
+import { at, BAR_H, BAR_W, bounds, fitting, labelAt, path, pips, PLACE_R, route, ZOOM } from "./geometry.js";
 import { Flights } from "./flights.js";
 import { iconPath } from "./icons.js";
 import { Ground } from "./labels.js";
 
 const KIND_WORD = { action: "Action place", resource: "Resource place", control: "Control place", macro: "Macro place", plain: "Plain place" };
 const LABEL_MOST = 24;
-const ZOOM = [0.12, 3];
 const FLASH_MS = 550;
 
 const tokens = (n) => (n === 1 ? "1 token" : `${n} tokens`);
@@ -403,20 +402,26 @@ export class NetView {
 
   resized() {
     const { clientWidth: w, clientHeight: h } = this.svg;
-    if ((!this.size || this.view === this.fitted) && w && this.elements.size) this.fit(); // the user has not moved or zoomed it
+    if ((!this.size || this.view === this.fitted) && w && this.elements.size) this.fit(this.least); // the user has not moved or zoomed it
     this.size = [w, h];
     this.events.moved?.(this);
   }
 
-  fit() {
+  /** Show the whole net, or with `least`, where that would make it smaller, the part around an active place. */
+  fit(least = 0) {
     const box = this.extent;
     const { clientWidth: w, clientHeight: h } = this.svg;
+    this.least = least;
     if (!w || !h) this.fitted = this.view; // on a tab that is not shown: fitted when it is
     if (!box || !w || !h) return;
-    const top = 46; // the bar lies over the drawing
-    const zoom = Math.max(ZOOM[0], Math.min(1.5, (w - 24) / (box[2] - box[0]), (h - top - 12) / (box[3] - box[1])));
-    this.look((w - (box[0] + box[2]) * zoom) / 2, top + (h - top - (box[1] + box[3]) * zoom) / 2, zoom);
+    this.look(...fitting(box, w, h, least, this.active[0]));
     this.fitted = this.view;
+  }
+
+  /** Places with tokens: those with a running action first, resources last. */
+  get active() {
+    const rank = (e) => (e.live.dataset.run ? 0 : e.kind === "resource" ? 2 : 1);
+    return [...this.elements.values()].filter((e) => e.tokens && !this.isFolded(e)).sort((a, b) => rank(a) - rank(b));
   }
 
   look(x, y, zoom) {

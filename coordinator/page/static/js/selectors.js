@@ -20,7 +20,7 @@ export class Selectors {
 
   row(name, { alternatives }) {
     const choose = h("select", { "aria-label": `Alternative for ${words(name)}`, onchange: () => this.choose(name, choose) },
-      h("option", { value: "" }, "learned choice"), alternatives.map((a) => h("option", { value: a.action }, words(a.action))));
+      h("option", { value: "" }, "automatic choice"), alternatives.map((a) => h("option", { value: a.action }, words(a.action))));
     const bars = alternatives.map((a) => h("li", {}, h("span", {}, words(a.action)), h("meter", { min: 0, max: 1 }), h("span", { class: "number" })));
     return h("li", { class: "selector" }, h("div", { class: "line" }, h("strong", {}, words(name)), choose), h("ul", { class: "bars" }, bars));
   }

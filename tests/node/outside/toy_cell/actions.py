@@ -300,6 +300,17 @@ def judge(ctx: Context, *, run: str) -> Result:
     return success()
 
 
+def slow_disk(ctx: Context, *, seconds: float) -> Result:
+    """Let each sync of its node take this long from now on."""
+
+    def fsync(file: int) -> None:
+        time.sleep(seconds)
+        os.fdatasync(file)
+
+    os.fsync = fsync  # type: ignore[assignment]
+    return success()
+
+
 def block(ctx: Context, *, seconds: float) -> Result:
     """Block the interpreter's only thread, as a driver's library may."""
     time.sleep(seconds)

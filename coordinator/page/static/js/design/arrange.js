@@ -1,7 +1,7 @@
 // Arranging: align, space evenly, automatic layout; and lines that show with which elements a dragged one is aligned.
 
 import { fill, s } from "../dom.js";
-import { snap } from "../geometry.js";
+import { READABLE, snap } from "../geometry.js";
 import { automatic } from "../layout.js";
 
 const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
@@ -42,7 +42,7 @@ export function layOut(designer) {
   const positions = automatic(part);
   designer.model.move(some ? about(positions, movable(designer)) : positions);
   designer.view.reroute(new Set(), true);
-  if (!some) designer.view.fit();
+  if (!some) designer.view.fit(READABLE);
 }
 
 /** Positions moved as a whole so that their middle is where that of the elements is. */

@@ -3,6 +3,7 @@
 import { Canvas } from "../canvas.js";
 import { attribute, h, words } from "../dom.js";
 import { loadOffers } from "../files.js";
+import { READABLE } from "../geometry.js";
 import { placed } from "../layout.js";
 import { toast } from "../toast.js";
 import { guides } from "./arrange.js";
@@ -14,7 +15,7 @@ import { Inspector } from "./inspector.js";
 import { KeyHelp, Keys } from "./keys.js";
 import { chooseInside } from "./inside.js";
 import { around, groups } from "./macros.js";
-import { MADE, Model } from "./model.js";
+import { HELD, MADE, Model } from "./model.js";
 import { Pointer } from "./pointer.js";
 import { Selection } from "./selection.js";
 import { Toolbox } from "./toolbox.js";
@@ -165,7 +166,7 @@ export class Designer {
     this.choose(new Set());
     this.draw();
     this.inspector.show(this.selection, true);
-    this.view.fit();
+    this.view.fit(READABLE);
   }
 
   // ---- edits --------------------------------------------------------------------------------------------------------
@@ -192,6 +193,10 @@ export class Designer {
     if (!names.size && !arc) return;
     if ([...names, ...(arc ? [arc.transition] : [])].every((name) => !this.model.has(name))) {
       toast("info", MADE);
+      return;
+    }
+    if (arc?.made) {
+      toast("info", HELD);
       return;
     }
     this.model.remove(names, arc ? [arc] : []);

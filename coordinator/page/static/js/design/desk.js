@@ -3,6 +3,7 @@
 import { askDialog } from "../dialog.js";
 import { h } from "../dom.js";
 import { askName, exportAs, importNet, listTasks, openTask, revisionOf, saveTask } from "../files.js";
+import { READABLE } from "../geometry.js";
 import { toast } from "../toast.js";
 import { emptyDocument } from "./model.js";
 
@@ -38,7 +39,7 @@ export class Desk {
     for (const name of known.includes(running) ? [running, ...known] : known) {
       if (await this.open(name)) return; // one that cannot be read does not keep the others closed
     }
-    this.designer.view.fit();
+    this.designer.view.fit(READABLE);
   }
 
   async refresh() {
@@ -62,7 +63,7 @@ export class Desk {
     const put = this.put(task, task.own === false);
     this.designer.findings.take(task);
     await this.refresh();
-    if (put === this.documents) this.designer.view.fit(); // what was begun meanwhile stays where the hand is
+    if (put === this.documents) this.designer.view.fit(READABLE); // what was begun meanwhile stays where the hand is
     return true;
   }
 
@@ -176,7 +177,7 @@ export class Desk {
     }
     const put = this.put({ name: "", revision: null, document: made.document });
     await this.refresh();
-    if (put === this.documents) this.designer.view.fit();
+    if (put === this.documents) this.designer.view.fit(READABLE);
     toast("ok", `Imported ${file.name}; it is not saved yet`);
   }
 }

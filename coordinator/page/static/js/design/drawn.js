@@ -35,14 +35,24 @@ function withErrorBranches(data, net) {
   return { ...net, transitions: { ...net.transitions, ...Object.fromEntries(made) } };
 }
 
+/** Arcs that `holds` makes: from the resources that the output places of a transition hold and its input places do not, and to those that only its input places hold. */
+function held(net, transition) {
+  const change = new Map();
+  for (const { place, direction, end, weight } of arcsOf(transition)) {
+    if (direction === "inhibit" || end === "going") continue;
+    for (const resource of listed(net.places?.[place]?.holds)) change.set(resource, (change.get(resource) ?? 0) + (direction === "in" ? weight : -weight));
+  }
+  return [...change].filter(([, n]) => n).map(([place, n]) => ({ place, end: null, counts: null, weight: Math.abs(n), inhibit: false, text: place, direction: n > 0 ? "out" : "in", made: true }));
+}
+
 /** Arcs of the drawn transitions; those that end in one macro place alike are one, with their weights summed. */
 function arcs(net, transitions, shown) {
   const joined = new Map();
   for (const { name } of transitions) {
-    for (const arc of arcsOf(net.transitions[name])) {
+    for (const arc of [...arcsOf(net.transitions[name]), ...held(net, net.transitions[name])]) {
       if (!shown.has(arc.place)) continue;
       const as = shown.get(arc.place);
-      const id = as === arc.place ? `${arc.direction}|${arc.text}|${name}` : `${arc.direction}|${as}:${arc.end ?? ""}|${name}`;
+      const id = as === arc.place ? `${arc.direction}|${arc.text}|${name}${arc.made ? "|holds" : ""}` : `${arc.direction}|${as}:${arc.end ?? ""}|${name}`;
       const before = joined.get(id);
       const inner = as === arc.place ? [] : [...(before?.inner ?? []), arc.place];
       joined.set(id, { ...arc, id, transition: name, place: as, weight: arc.weight + (before?.weight ?? 0), inner });
