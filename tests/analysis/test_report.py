@@ -42,6 +42,7 @@ from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Status, Task
 from petrobot.coordinator.task.file import load, loads
 from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.wording import together
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers, queue
 from tests.analysis.random_nets import nets
 from tests.analysis.test_execution_graph import COMMON, whole_tasks
@@ -513,3 +514,8 @@ def test_the_fault_of_a_rates_file_names_the_rates_file(
     rates.write_bytes(content)
     found = analyse_command(path, rates=rates)
     assert said in found.text and (found.code == 2) is bool(said)
+
+
+def test_what_holds_for_several_names_is_said_once() -> None:
+    told = ["a: is slow", "the cell: is known", "b: is slow", "c: is fast", "no name"]
+    assert together(told) == ["a, b: is slow", "the cell: is known", "c: is fast", "no name"]

@@ -7,7 +7,7 @@ from the compiled tables that all of them read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -39,7 +39,8 @@ from petrobot.coordinator.studies.forecast.distributions import Drawer
 from petrobot.coordinator.studies.forecast.history import STATUSES
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import DONE, GOING, IDLE, Play
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Task, Value
+from petrobot.coordinator.task.conditions import ConditionFault, Expression
 from petrobot.coordinator.task.net import Marking, Net
 from tests.engine.test_properties import DEVICES, Journal, tasks
 
@@ -140,6 +141,15 @@ def simulator_agrees(net: Net, markings: list[Marking]) -> None:
             assert tuple(moved.tolist()) == successor(net, marking, t)
 
 
+def true_in(condition: Expression | None, values: Mapping[str, Value]) -> bool:
+    """Return whether a condition is true; without a truth value it counts as false."""
+    assert condition is not None
+    try:
+        return condition.holds(values)
+    except ConditionFault:
+        return False
+
+
 class Frozen(Play):
     """A forecast whose runs are set by the test, and neither drawn nor counted."""
 
@@ -152,6 +162,9 @@ class Frozen(Play):
     def put(self, states: list[State]) -> None:
         """One column for each state."""
         self._tokens = np.array([s.marking for s in states], dtype=np.int64).T.copy()
+        known = self._s.first_values
+        self._valuations = [{name: s.variables[name] for name in known} for s in states]
+        self._valuation = np.arange(len(states))
         self.names = dict[tuple[int, int], str]()  # of the runs, by row and column
         for q, place in enumerate(self._s.vocabulary.places):
             for i, state in enumerate(states):
@@ -171,10 +184,13 @@ class Frozen(Play):
         compiled = Engine(task, DEVICES).compiled
         for move in self._s.moves:
             x, before = compiled.transitions[move.number], self._tokens.copy()
-            unjudged = replace(move, allowed=None)
+            unjudged = replace(move, allowed=None, known=None)
             able = self._enabled(unjudged)
             unheard = replace(x, actions=tuple(replace(a, raised=()) for a in x.actions), when=None)
+            held = None if move.known is None else self._holds(move.known)
             for i, state in enumerate(states):
+                if held is not None:
+                    assert bool(held[i]) == true_in(move.known, state.variables), move.name
                 runs = arcs_satisfied(Draft(compiled, state), unheard)
                 assert bool(able[i]) == (runs is not None), move.name
                 if runs is not None:
@@ -192,7 +208,9 @@ class Frozen(Play):
             assert not (able & ~rows).any()
             columns = np.flatnonzero(able)
             phases = self._phase.copy()
+            told = self._valuation.copy()
             self._fire(move, columns)
+            self._valuation = told
             for i in columns.tolist():
                 expected = successor(task.net, states[i].marking, move.number)
                 assert tuple(self._tokens[:, i].tolist()) == expected, move.name
@@ -208,7 +226,9 @@ def forecast_agrees(task: Task, states: list[State]) -> None:
         return  # a preemption that forecasts refuse
     fit = [s for s in states if not s.stopping]
     if fit:
-        unmeasured = cast(Drawer, SimpleNamespace(as_measured=lambda name: False))
+        unmeasured = cast(
+            Drawer, SimpleNamespace(as_measured=lambda name: False, branches=lambda members: {})
+        )
         frozen = Frozen(structure, unmeasured, {}, np.zeros(len(fit), np.int64))
         frozen.put(fit)
         frozen.agrees(task, fit)

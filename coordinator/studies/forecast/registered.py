@@ -45,8 +45,8 @@ LARGEST = 50_000
 """Largest number of markings for which the stochastic view is solved."""
 CONTRADICTS_SHARE, CONTRADICTS_TIME = 0.1, 0.25
 """By how much a share, and relatively a mean time, of simulated net and stochastic view may differ.
-Phase-type fits keep each mean and share; races of parallel runs, and statuses that depend on each
-other, explain no more in all that was tried."""
+A heuristic: phase-type fits keep each mean and share, so only races of parallel runs, and statuses
+that depend on each other, move these figures; the faults that it is to find were .3 and more."""
 JUMPS = 20_000
 """Largest number of jumps of the uniformised chain for which its quantile is computed."""
 

@@ -754,7 +754,7 @@ b_lost: b:error -> end
     assert condition_doubts(replace(training, whole=True), Structure.of(training.task).moves) == []
 
 
-BRANCHES = """
+DECIDED = """
 [variables]
 low = { type = "bool" }
 mode = { type = "str", initial = "first" }
@@ -766,7 +766,7 @@ kind = "control"
 @pytest.mark.parametrize("priority", ["", "\npriority = 1"])
 def test_branches_that_variables_decide_are_taken_as_in_the_trials(priority: str) -> None:
     """A battery that is low in 0.2 of the trials, and never after it was charged."""
-    text = BRANCHES + with_transitions(f"""
+    text = DECIDED + with_transitions(f"""
 start: jobs -> a
 ready: a:normal -> held
 ok: held -> end
@@ -793,7 +793,7 @@ charged: b:normal -> held
 
 def test_variables_that_transitions_set_are_played_as_the_engine_does() -> None:
     """The second run takes the other way, although no trial did."""
-    text = BRANCHES + with_transitions("""
+    text = DECIDED + with_transitions("""
 start: jobs -> a
 again: a:normal -> held
 when = "mode == 'first'"
@@ -808,7 +808,7 @@ when = "mode == 'second'"
 
 
 def test_a_branch_with_another_condition_or_other_values_is_doubtful() -> None:
-    text = BRANCHES + with_transitions("""
+    text = DECIDED + with_transitions("""
 start: jobs -> a
 ready: a:normal -> held
 ok: held -> end
