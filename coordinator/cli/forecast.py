@@ -226,7 +226,6 @@ def _trainings(
 ) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
     """Training trials by regime in a cell, the estimates, and what the forecast says about where
     they come from."""
-    from petrobot.coordinator.analysis.may_run import devices_of
     from petrobot.coordinator.learning.estimates_file import MOCK, SIMULATED
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import TASK_COPY, digest, read_manifest
@@ -243,7 +242,7 @@ def _trainings(
         known = kept.estimates
         _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
         return (
-            trainings_of(task, known, devices_of(cell)),
+            trainings_of(task, known, cell),
             known,
             {
                 "estimates": {"file": path.name, "sha256": digest(path)},
@@ -260,7 +259,7 @@ def _trainings(
     same = digest(file) == plan.digests["task"] or _same_form(task, ran)
     if not same:
         rows = of_this_form(task, ran, rows)
-    found = by_regime(task, rows, devices_of(cell), same)
+    found = by_regime(task, rows, cell, same)
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")
     if not any(len(training.runs) for training in found.values()):
