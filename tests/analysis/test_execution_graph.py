@@ -653,3 +653,35 @@ def test_every_play_of_the_engine_is_a_path_with_short_forms(
 @given(whole_tasks(), st.data())
 def test_every_play_of_the_engine_is_a_path_at_length(task: Task, data: st.DataObject) -> None:
     graph_and_engine_agree(task, data)
+
+
+def philosophers(n: int, steps: int) -> Task:
+    """Return a task in which each of n arms makes some steps, then takes its own fork, and later
+    that of the next arm: all arms may wait for each other."""
+    places, lines = list[str](), list[str]()
+    for i in range(n):
+        chain = [f"s{i}_{k}" for k in range(steps)] + [f"left{i}", f"right{i}"]
+        places += [f'fork{i} = {{ kind = "resource", tokens = 1 }}', f"todo{i} = {{ tokens = 1 }}"]
+        places += [f'over{i} = {{ kind = "control" }}', f"ready{i} = {{}}", f"half{i} = {{}}"]
+        places += [f'{name} = {{ kind = "action", task = "move" }}' for name in chain]
+        after = [*chain[1:steps], f"ready{i}", f"half{i}", f"over{i}"]
+        forks = f"fork{i}", f"fork{(i + 1) % n}"
+        for name, to in zip(chain, after, strict=True):
+            out = [to, *forks] if to == f"over{i}" else [to]
+            lines.append(f'{name}_n = {{ in = ["{name}:normal"], out = {out} }}')
+            lines.append(f'{name}_x = {{ in = ["{name}:error"], out = ["{name}"] }}')
+        lines.append(f'go{i} = {{ in = ["todo{i}"], out = ["s{i}_0"] }}')
+        lines.append(f'take{i} = {{ in = ["ready{i}", "{forks[0]}"], out = ["left{i}"] }}')
+        lines.append(f'both{i} = {{ in = ["half{i}", "{forks[1]}"], out = ["right{i}"] }}')
+    final = " and ".join(f"over{i} == 1" for i in range(n))
+    text = f'schema = 1\n[task]\nname = "forks"\nfinal = "{final}"\n[primitive_tasks]\n'
+    text += "move = { deadline = 9.0 }\n[places]\n" + "\n".join(places)
+    return loads(text + "\n[transitions]\n" + "\n".join(lines))
+
+
+def test_a_dead_end_far_behind_many_states_is_found() -> None:
+    """Eight arms take their first forks at the same time, after 24 steps. Neither breadth
+    first nor plays that draw each stimulus by chance come there within this limit."""
+    x = execute(philosophers(8, 2), limit=20_000, free_choice=True)
+    assert not x.complete and x.dead.any()
+    assert len(x.path(int(np.flatnonzero(x.dead)[0]))) >= 20
