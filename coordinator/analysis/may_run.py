@@ -7,7 +7,7 @@ answer, not in the question.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -45,6 +45,8 @@ class Cell:
     """The device of each action that has one."""
     translates: Mapping[str, str] | None = None
     """The primitive task that each action translates, as its file says; None: not compared."""
+    periods: Mapping[str, float] = field(default_factory=dict)
+    """The period of each event that a timer raises (s)."""
 
 
 def devices_of(cell: Cell | None) -> Mapping[str, str] | None:

@@ -233,7 +233,6 @@ def _trainings(
 ) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
     """Training trials by regime in a cell, the estimates, and what the forecast says about where
     they come from."""
-    from petrobot.coordinator.analysis.may_run import devices_of
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import TASK_COPY, digest, read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table
@@ -249,7 +248,7 @@ def _trainings(
         known = kept.estimates
         _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
         return (
-            trainings_of(task, known, devices_of(cell)),
+            trainings_of(task, known, cell),
             known,
             {
                 "estimates": {"file": path.name, "sha256": digest(path)},
@@ -264,12 +263,12 @@ def _trainings(
     rows = list(read_table(path / TABLE))
     ran = load_task(str(path / TASK_COPY)) if (path / TASK_COPY).is_file() else None
     same = digest(file) == plan.digests["task"] or _same_form(task, ran)
-    earlier = by_regime(ran, rows, devices_of(cell)) if ran is not None and not same else {}
+    earlier = by_regime(ran, rows, cell) if ran is not None and not same else {}
     if not same:
         rows = of_this_form(task, ran, rows)
     found = {
         regime: replace(training, earlier=earlier.get(regime))
-        for regime, training in by_regime(task, rows, devices_of(cell), same).items()
+        for regime, training in by_regime(task, rows, cell, same).items()
     }
     if not found:
         raise CommandError(2, f"{path}: the table holds no trial yet")

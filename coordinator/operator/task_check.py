@@ -172,6 +172,7 @@ def cell_of(directory: Directory) -> Cell:
         str(directory.source),
         {action.name: action.device for action in actions if action.device},
         {action.name: action.task for action in actions if action.task},
+        {timer.name: timer.period for timer in directory.timers.values()},
     )
 
 

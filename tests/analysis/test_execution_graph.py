@@ -6,10 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, assume, event, given, settings
+from hypothesis import HealthCheck, Phase, assume, event, find, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.execution.causes import explain, settled
@@ -53,6 +54,8 @@ from petrobot.coordinator.task import (
     Status,
     Task,
     Transition,
+    Variable,
+    VariableType,
 )
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
@@ -88,6 +91,10 @@ alternatives = ["x"]
 deadline = 2.0
 [events.bell]
 scope = "external"
+[variables.b]
+type = "bool"
+[places.c0]
+kind = "control"
 [places.whole]
 kind = "macro"
 subnet = "part"
@@ -107,6 +114,22 @@ out = ["over"]
 in = ["move:error"]
 out = ["failed"]
 """
+WITH_ARGUMENTS = (
+    BODY.replace(
+        'subnet = "part"\n', 'subnet = "part"\nargs = { to = "c0", most = 2, seen = "b" }\n'
+    )
+    .replace('"p0"\n[subnets', '"p0"\nout = { v = "seen" }\n[subnets')
+    .replace('out = ["over"]', 'out = ["over", "to"]\nwhen = "seen or n <= most"')
+    .replace("[variables.b]", '[variables.n]\ntype = "int"\n[variables.b]')
+    .partition("[subnets.part.transitions.broken]")[0]
+    + """[subnets.part.errors]
+to = "failed"
+[subnets.part.parameters]
+to = "place"
+most = "int"
+seen = "variable"
+"""
+)
 
 
 @st.composite
@@ -118,16 +141,23 @@ def whole_tasks(draw: st.DrawFn) -> Task:
     """
     task = draw(tasks())
     for change in draw(st.lists(st.sampled_from(CHANGES), max_size=4, unique=True)):
-        acting = change not in (plain, given_up, erring) and draw(st.integers(0, 4)) > 0
-        suitable = [n for n, p in task.places.items() if (p.kind is Kind.ACTION) is acting]
-        place = task.places[draw(st.sampled_from(suitable or sorted(task.places)))]
-        transition = task.transitions[draw(st.sampled_from(sorted(task.transitions)))]
-        other = draw(st.sampled_from(sorted(task.places)))
-        changed = change(task, place, transition, other)
+        changed = draw(changes(task, change))
         if not faults(changed):
             task = changed
             event(change.__name__)
     return task
+
+
+@st.composite
+def changes(draw: st.DrawFn, task: Task, change: Change) -> Task:
+    """Draw places and a transition, and change them; the task may have faults then."""
+    acting = change not in (plain, given_up, erring) and draw(st.integers(0, 4)) > 0
+    suitable = [n for n, p in task.places.items() if (p.kind is Kind.ACTION) is acting]
+    place = task.places[draw(st.sampled_from(suitable or sorted(task.places)))]
+    transition = task.transitions[draw(st.sampled_from(sorted(task.transitions)))]
+    kinds = OTHERS.get(change, Kind)
+    fit = [n for n, p in task.places.items() if p.kind in kinds]
+    return change(task, place, transition, draw(st.sampled_from(fit or sorted(task.places))))
 
 
 Change = Callable[[Task, Place, Transition, str], Task]
@@ -156,7 +186,8 @@ def copying(task: Task, place: Place, transition: Transition, other: str) -> Tas
 
 
 def trying(task: Task, place: Place, transition: Transition, other: str) -> Task:
-    return moved(task, places=[replace(place, tries=2, servers=1, retry_unknown=other == "c0")])
+    tries, unknown = (2, True) if other == "c0" else (3, False)
+    return moved(task, places=[replace(place, tries=tries, servers=None, retry_unknown=unknown)])
 
 
 def timing(task: Task, place: Place, transition: Transition, other: str) -> Task:
@@ -172,9 +203,9 @@ def erring(task: Task, place: Place, transition: Transition, other: str) -> Task
     return replace(task, errors_to=other)
 
 
-def nesting(task: Task, place: Place, transition: Transition, other: str) -> Task:
+def nesting(task: Task, place: Place, transition: Transition, other: str, text: str = BODY) -> Task:
     """Replace an action place by a subnet with an action in it."""
-    body = loads(BODY)
+    body = loads(text)
     whole = replace(body.places["whole"], name=place.name)
     ends = {End.PREEMPT: End.ERROR, End.GOING: End.NORMAL}
     rewired = [
@@ -195,6 +226,54 @@ def nesting(task: Task, place: Place, transition: Transition, other: str) -> Tas
     return replace(nested, subnets=body.subnets)
 
 
+def lending(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Replace an action place by a subnet with arguments: a place, a value and a variable."""
+    return nesting(task, place, transition, other, WITH_ARGUMENTS)
+
+
+def asking(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Let a condition ask whether a run was executed."""
+    when = parse(f"{place.name}.executed == 'no' or {place.name}.status == 'success'")
+    return moved(task, transitions=[replace(transition, when=when)])
+
+
+def limiting(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Let a condition read a parameter."""
+    limited = moved(task, transitions=[replace(transition, when=parse("n < most"))])
+    return replace(limited, parameters={"most": 2})
+
+
+def measuring(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Let an action write a float that a condition reads."""
+    return _told(task, place, transition, Variable("f", VariableType.FLOAT, 0.5), "f > 1.5")
+
+
+def naming(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Let an action write a text that a condition reads."""
+    side = Variable("s", VariableType.STR, values=("left", "right"))
+    return _told(task, place, transition, side, "s == 'left' or s == none")
+
+
+def _told(task: Task, place: Place, transition: Transition, new: Variable, when: str) -> Task:
+    told = moved(
+        task,
+        places=[replace(place, out={"v": new.name})],
+        transitions=[replace(transition, when=parse(when))],
+    )
+    return replace(told, variables={**task.variables, new.name: new})
+
+
+def delaying(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Give all transitions without events timers of several lengths."""
+    lengths = zip(task.transitions.values(), cycle((0.5, 2.0, 4.0)), strict=False)
+    return moved(task, transitions=[replace(t, after=s) for t, s in lengths if not t.events])
+
+
+def counting(task: Task, place: Place, transition: Transition, other: str) -> Task:
+    """Count the runs of the task and the goals that they met."""
+    return replace(task, runs_place=other, goal_transitions=(transition.name,))
+
+
 def stopping(task: Task, place: Place, transition: Transition, other: str) -> Task:
     """A listening action ends the mission run while it is active."""
     listener = replace(place, listen=True, tokens=1)
@@ -212,8 +291,36 @@ CHANGES: tuple[Change, ...] = (
     holding,
     erring,
     nesting,
+    lending,
+    asking,
+    limiting,
+    measuring,
+    naming,
+    delaying,
+    counting,
     stopping,
 )
+OTHERS: dict[Change, tuple[Kind, ...]] = {
+    holding: (Kind.RESOURCE,),
+    erring: (Kind.CONTROL, Kind.PLAIN),
+    counting: (Kind.CONTROL,),
+}
+"""The kinds of place that the last argument can name; any for the others."""
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_each_feature_is_drawn(change: Change) -> None:
+    """A feature that fits no task would be left out without a word."""
+    drawn = tasks().flatmap(lambda task: changes(task, change))
+    find(drawn, lambda task: not faults(task), settings=settings(COMMON, phases=[Phase.generate]))
+
+
+VALUES: dict[VariableType, st.SearchStrategy[object]] = {
+    VariableType.BOOL: st.booleans(),
+    VariableType.INT: st.integers(-9, 9),
+    VariableType.FLOAT: st.floats(-9, 9),
+    VariableType.STR: st.sampled_from(("left", "right", "above")),
+}
 
 
 @dataclass
@@ -284,8 +391,7 @@ class Player:
         return found
 
     def _value(self, name: str) -> object:
-        kind = self.engine.task.flat.variables[name].type.value
-        return self.data.draw(st.booleans() if kind == "bool" else st.integers(-9, 9))
+        return self.data.draw(VALUES[self.engine.task.flat.variables[name].type])
 
 
 class Path:
@@ -547,3 +653,35 @@ def test_every_play_of_the_engine_is_a_path_with_short_forms(
 @given(whole_tasks(), st.data())
 def test_every_play_of_the_engine_is_a_path_at_length(task: Task, data: st.DataObject) -> None:
     graph_and_engine_agree(task, data)
+
+
+def philosophers(n: int, steps: int) -> Task:
+    """Return a task in which each of n arms makes some steps, then takes its own fork, and later
+    that of the next arm: all arms may wait for each other."""
+    places, lines = list[str](), list[str]()
+    for i in range(n):
+        chain = [f"s{i}_{k}" for k in range(steps)] + [f"left{i}", f"right{i}"]
+        places += [f'fork{i} = {{ kind = "resource", tokens = 1 }}', f"todo{i} = {{ tokens = 1 }}"]
+        places += [f'over{i} = {{ kind = "control" }}', f"ready{i} = {{}}", f"half{i} = {{}}"]
+        places += [f'{name} = {{ kind = "action", task = "move" }}' for name in chain]
+        after = [*chain[1:steps], f"ready{i}", f"half{i}", f"over{i}"]
+        forks = f"fork{i}", f"fork{(i + 1) % n}"
+        for name, to in zip(chain, after, strict=True):
+            out = [to, *forks] if to == f"over{i}" else [to]
+            lines.append(f'{name}_n = {{ in = ["{name}:normal"], out = {out} }}')
+            lines.append(f'{name}_x = {{ in = ["{name}:error"], out = ["{name}"] }}')
+        lines.append(f'go{i} = {{ in = ["todo{i}"], out = ["s{i}_0"] }}')
+        lines.append(f'take{i} = {{ in = ["ready{i}", "{forks[0]}"], out = ["left{i}"] }}')
+        lines.append(f'both{i} = {{ in = ["half{i}", "{forks[1]}"], out = ["right{i}"] }}')
+    final = " and ".join(f"over{i} == 1" for i in range(n))
+    text = f'schema = 1\n[task]\nname = "forks"\nfinal = "{final}"\n[primitive_tasks]\n'
+    text += "move = { deadline = 9.0 }\n[places]\n" + "\n".join(places)
+    return loads(text + "\n[transitions]\n" + "\n".join(lines))
+
+
+def test_a_dead_end_far_behind_many_states_is_found() -> None:
+    """Eight arms take their first forks at the same time, after 24 steps. Neither breadth
+    first nor plays that draw each stimulus by chance come there within this limit."""
+    x = execute(philosophers(8, 2), limit=20_000, free_choice=True)
+    assert not x.complete and x.dead.any()
+    assert len(x.path(int(np.flatnonzero(x.dead)[0]))) >= 20

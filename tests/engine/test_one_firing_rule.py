@@ -41,8 +41,10 @@ from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import DONE, GOING, IDLE, Play
 from petrobot.coordinator.task import Task, Value
 from petrobot.coordinator.task.conditions import ConditionFault, Expression
+from petrobot.coordinator.task.file import dumps, loads
 from petrobot.coordinator.task.net import Marking, Net
-from tests.engine.test_properties import DEVICES, Journal, tasks
+from tests.analysis.test_execution_graph import whole_tasks
+from tests.engine.test_properties import DEVICES, Journal
 
 EXPLORERS: tuple[Callable[[Explored], Explorer], ...] = (IntegerEngine, NumpyEngine)
 COMMON = settings(
@@ -207,14 +209,14 @@ class Frozen(Play):
             rows = concession(self._s.rule, before, move.number)
             assert not (able & ~rows).any()
             columns = np.flatnonzero(able)
-            phases = self._phase.copy()
+            phases, taken = self._phase.copy(), self._taken.copy()
             told = self._valuation.copy()
             self._fire(move, columns)
             self._valuation = told
             for i in columns.tolist():
                 expected = successor(task.net, states[i].marking, move.number)
                 assert tuple(self._tokens[:, i].tolist()) == expected, move.name
-            self._tokens = before
+            self._tokens, self._taken = before, taken
             self._phase[: len(phases)], self._phase[len(phases) :] = phases, IDLE
 
 
@@ -235,25 +237,28 @@ def forecast_agrees(task: Task, states: list[State]) -> None:
 
 
 def all_agree(task: Task, data: st.DataObject) -> None:
-    """Play the task in the engine, and give every marking at rest to the others."""
+    """Play the task in the engine as a file expands it, and give every marking at rest to the
+    others."""
+    written, task = task, loads(dumps(task))
+    assert task == written
     states = visited(task, data)
     engine_agrees(task, states)
     forecast_agrees(task, states)
     markings = list(dict.fromkeys(s.marking for s in states))
-    ranked = replace(task.net, priority=tuple(t.priority for t in task.transitions.values()))
+    ranked = replace(task.net, priority=tuple(t.priority for t in task.flat.transitions.values()))
     for net in (task.net, ranked):
         explorers_agree(net, markings)
         simulator_agrees(net, markings)
 
 
 @settings(COMMON, max_examples=60)
-@given(tasks(), st.data())
+@given(whole_tasks(), st.data())
 def test_all_players_of_a_task_agree(task: Task, data: st.DataObject) -> None:
     all_agree(task, data)
 
 
 @pytest.mark.proof
 @settings(COMMON, max_examples=5000)
-@given(tasks(), st.data())
+@given(whole_tasks(), st.data())
 def test_all_players_of_a_task_agree_at_length(task: Task, data: st.DataObject) -> None:
     all_agree(task, data)

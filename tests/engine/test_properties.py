@@ -291,6 +291,8 @@ class Journal:
             found += [
                 RunEnded(r.id, s, "lost", values={"v": v}) for s in Status for v in (True, 2, None)
             ]
+            found += [RunEnded(r.id, Status.SUCCESS, values={"v": v}) for v in (2.5, "left")]
+            found.append(RunEnded(r.id, Status.ERROR, "", executed=Executed.NO))
             found += [
                 RunRaised(r.id, "seen"),
                 RunStarted(r.id),

@@ -13,7 +13,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from petrobot.coordinator.analysis.may_run import BUDGET, may_run
+from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.engine import Begin, Choose, Chosen, Engine, EventOccurred, RunEnded
@@ -94,6 +94,34 @@ tidied = { in = ["tidy:normal"], out = ["watching"] }
     )
 
 
+BELT = """
+schema = 1
+[task]
+name = "belt"
+runs_place = "parts"
+final = "parts == 0 and ready == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+MEMORY
+[primitive_tasks]
+work = { deadline = 9.0 }
+rest = { deadline = 9.0 }
+[places]
+parts = { kind = "control", tokens = 1 }
+ready = { tokens = 1 }
+work = { kind = "action" }
+rest = { kind = "action" }
+broken = { kind = "control" }
+[transitions]
+take = { in = ["parts", "ready"], out = ["work"] }
+next = { in = ["work:normal"], out = ["rest"], event = "alarm" }
+back = { in = ["rest:normal"], out = ["ready"], event = "alarm" }
+"""
+"""The belt moves on twice for one part, each time when the event comes."""
+
+
 @dataclass
 class Played:
     """What missions of the engine came to."""
@@ -108,8 +136,8 @@ class Played:
         return sum(trial.fired.get("low", 0) for trial in self.trials)
 
 
-def missions(task: Task, n: int) -> Played:
-    """Play missions by a clock; the event comes at random, at a known rate."""
+def missions(task: Task, n: int, period: float = 0.0) -> Played:
+    """Play missions by a clock; the event comes at random, at a known rate, or by a timer."""
     out, random = Played(), np.random.default_rng(7)
     engine = Engine(task)
     selector = LearningSelector(Learning(task, "fixed"))
@@ -117,7 +145,8 @@ def missions(task: Task, n: int) -> Played:
         log = TrialLog(task, lambda record, values: record.seconds)
         queue: list[tuple[float, int, Stimulus]] = [(0.0, 0, Begin())]
         numbers, state, over = count(1), engine.initial(), False
-        heapq.heappush(queue, (random.exponential(MEAN), next(numbers), EventOccurred("alarm")))
+        first = random.uniform(0, period) if period else random.exponential(MEAN)
+        heapq.heappush(queue, (first, next(numbers), EventOccurred("alarm")))
         own = LearningSelector(selector.learning)
         for _step in range(10_000):
             now, _, stimulus = heapq.heappop(queue)
@@ -125,7 +154,7 @@ def missions(task: Task, n: int) -> Played:
                 observer.stimulus(now, stimulus)
             state, said = engine.handle(state, stimulus)
             if isinstance(stimulus, EventOccurred):
-                later = now + random.exponential(MEAN)
+                later = now + (period or random.exponential(MEAN))
                 heapq.heappush(queue, (later, next(numbers), EventOccurred("alarm")))
             for instruction in said:
                 for observer in (log, own):
@@ -181,6 +210,25 @@ def test_the_recorded_rate_is_that_of_the_event(memory: str) -> None:
         ).run()
         assert play.time.mean() == pytest.approx(time.mean(), abs=bound)
         assert event_doubts(training) == []
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("memory", ("latched", "kept"))
+def test_the_event_of_a_timer_comes_at_its_period(memory: str) -> None:
+    """Where no single wait can be repeated, the location file gives the period. At random with the
+    same rate, the spread would be three times as large."""
+    task = loads(BELT.replace("MEMORY", MEMORIES[memory]), "belt.toml")
+    trials = missions(task, 300, period=5.0).trials
+    training = Training.of(task, trials, cell=Cell({}, periods={"alarm": 5.0}))
+    random = np.random.default_rng(1)
+    drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, len(trials))), random)
+    everywhere = np.zeros(4_000, np.int64)
+    choices, periods = choices_of(training), training.periods
+    play = Play(Structure.of(task), drawer, choices, everywhere, periods=periods).run()
+    time = np.array([trial.time for trial in trials])
+    assert play.time.mean() == pytest.approx(time.mean(), abs=3 * time.std() / sqrt(len(time)))
+    assert play.time.std() == pytest.approx(time.std(), rel=0.1)
+    assert play.time.max() <= 1.0 + 2 * 5.0
 
 
 def waits(memory: str, script: list[tuple[float, Stimulus]]) -> list[Waited]:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import cycle
+from math import exp
 from typing import NamedTuple
 
 import numpy as np
@@ -72,6 +73,16 @@ is careful, as each second one is, and a state that was explored before. These o
 and then nothing deeper is seen."""
 LOOKS = 64
 """So many states that a search for the nearest one looks at cost as much as a stimulus."""
+QUICK = 8
+"""Before that, quick plays use an eighth as many. They follow one stimulus of each state and keep
+no state, so they come far deeper."""
+SPREADS, JITTER = (0.0, 0.5, 2.0), 0.1
+"""How much the times of stimuli differ in a quick play, and how much each of them from one case to
+the next (standard deviations of the logarithm). With equal times, branches come to their resources
+together, and each holds one while it waits for the next."""
+DOUBLED, CARELESS = 4, 0.25
+"""How often the length of a quick play is doubled at most, and the share of those in which runs may
+end in ERROR."""
 STALE = 16
 """Steps without a new state after which a play continues at the nearest new one."""
 QUEUE = 16
@@ -422,7 +433,10 @@ class _Search:
         state, said = self.engine.handle(begun, Begin())
         self._found(begun, frozenset(), state, said, None)
         known = self._explore(0, limit)
-        expanded = self._play(known, limit + limit // PLAYS)
+        lost = (
+            self._quick_plays(limit // QUICK) if known < len(self.states) and not self.late else []
+        )
+        expanded = self._play(known, limit + limit // PLAYS, lost)
         by_hand = np.zeros(len(self.edges[0]), np.bool_)
         return self._result(_fired(said), expanded, by_hand, limit)
 
@@ -456,10 +470,54 @@ class _Search:
                 looked, self.late = self.handled, overtime()
         return i
 
-    def _play(self, known: int, limit: int) -> Iterable[int]:
+    def _quick_plays(self, effort: int) -> list[str]:
+        """Play with one stimulus for each state, until a play comes where no end can follow. Return
+        what it did, as texts of stimuli; empty if none was found.
+
+        In a play each stimulus takes a time of its own, and the first one that is due comes.
+        """
+        random, engine = np.random.Generator(np.random.PCG64(0)), self.engine
+        left = effort
+        while left > 0 and not overtime():
+            spread = SPREADS[random.integers(len(SPREADS))]
+            length = SHORTEST << int(random.integers(DOUBLED + 1))
+            careful, state, orders = random.random() >= CARELESS, self.states[0], self.orders[0]
+            times, due = dict[str, float](), dict[Hashable, float]()
+            path, now = list[str](), 0.0
+            for _ in range(length):
+                waiting = dict[Hashable, float]()
+                first: tuple[float, Hashable, Cause] | None = None
+                for cause in self.names.stimuli(state, orders):
+                    end = cause.stimulus
+                    run = end.run if isinstance(end, RunEnded | RunRaised) else ""
+                    if careful and isinstance(end, RunEnded) and end.status is Status.ERROR:
+                        continue
+                    if (at := due.get((run, cause.text))) is None:
+                        time = times.setdefault(cause.text, spread * random.standard_normal())
+                        at = now + exp(time + JITTER * random.standard_normal())
+                    waiting[run, cause.text] = at
+                    if first is None or at < first[0]:
+                        first = at, (run, cause.text), cause
+                if first is None:
+                    break
+                now, key, cause = first
+                del waiting[key]
+                due, before = waiting, state
+                state, said = engine.handle(state, cause.stimulus)
+                orders = self.names.next_orders(before, orders, state)
+                path.append(cause.text)
+                left -= 1 + len(_fired(said))
+                if state.mode is not Mode.RUNNING:
+                    break
+            dead = state.mode is Mode.FINISHED and at_end(engine.compiled, state.marking) is None
+            if dead or not engine.can_end(state):
+                return path
+        return []
+
+    def _play(self, known: int, limit: int, lost: Sequence[str] = ()) -> Iterable[int]:
         """Play from the first state at random, the same way each time, and follow all stimuli of
         the states that the plays come through. Return the states whose edges are there; before,
-        those are the first `known`."""
+        those are the first `known`. The plays begin where `lost` ends, as long as that is new."""
         source, target, label = self.edges
         rows = np.searchsorted(source, range(known + 1)).tolist()
         edges = {i: range(rows[i], rows[i + 1]) for i in range(known)}
@@ -473,21 +531,32 @@ class _Search:
             before, after = (self.states[row[e]].marking for row in (source, target))
             return self.steps[label[e]].fails or any(after[p] > before[p] for p in never)
 
+        def follow(i: int) -> None:
+            begin = len(target)
+            self._expand(i)
+            edges[i] = range(begin, len(target))
+
+        first = 0
+        for text in lost:
+            if first not in edges:
+                follow(first)
+            found = (target[e] for e in edges[first] if self.steps[label[e]].text == text)
+            first = next(found, first)  # what changes nothing has no edge
         while len(edges) < len(self.states) and self.handled < limit and not self.late:
-            i, stale, careful = 0, 0, not careful
+            i, stale, careful = first, 0, not careful
             for _ in range(next(lengths)):
                 self.handled += 1
                 if i not in edges:
-                    begin = len(target)
-                    self._expand(i)
-                    edges[i] = range(begin, len(target))
+                    follow(i)
                 ways = [e for e in edges[i] if target[e] != i]
                 if stale >= STALE and all(target[e] in edges or avoided(e) for e in ways):
                     # Else a part that the task never leaves would hardly be explored to its end.
                     if (i := self._nearest(i, edges, avoided)) < 0:
+                        first = 0
                         break
                     continue
                 if not ways:
+                    first = 0
                     break
                 shares = list[float]()
                 for e in ways:

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.may_run import Cell, devices_of
 from petrobot.coordinator.analysis.net.ordinary import contended
 from petrobot.coordinator.analysis.time.measured import LATE, is_cause
 from petrobot.coordinator.analysis.time.whatif import Change, in_range, statuses_of
@@ -204,6 +205,8 @@ class Training:
     the result of a whole trial is unknown."""
     devices: Mapping[str, str] = field(default_factory=dict)
     """By action: the device for which its runs may have to wait, because other runs use it."""
+    periods: Mapping[str, float] = field(default_factory=dict)
+    """By event: the period of the timer that raises it (s)."""
     same: bool = True
     """False if the trials are of an earlier form of the task: they tell of its runs, but not what
     whole trials come to."""
@@ -225,16 +228,17 @@ class Training:
         trials: Iterable[Trial],
         *,
         whole: bool = True,
-        devices: Mapping[str, str] | None = None,
+        cell: Cell | None = None,
         same: bool = True,
     ) -> Training:
-        """Prepare trials. `devices`: the device of each action that has one. Raises ValueError if
-        there are no trials."""
+        """Prepare trials. `cell`: the devices for which runs may wait, and the timers. Raises
+        ValueError if there are no trials."""
+        devices = devices_of(cell) or {}
         kept, vocabulary = tuple(trials), RunVocabulary.of(task)
         if not kept:
             raise ValueError("expected at least one trial to learn from, got none")
-        shared = contended(task, devices or {})
-        waiting = {a: device for a, device in (devices or {}).items() if device in shared}
+        shared = contended(task, devices)
+        waiting = {a: device for a, device in devices.items() if device in shared}
         if any(run.waited is None and run.action in waiting for t in kept for run in t.runs):
             waiting = {}  # an older table: the waits are in the durations
         waits: dict[str, list[tuple[Waited, int]]] = {}
@@ -254,6 +258,7 @@ class Training:
             {name: known for name, known in found.items() if known is not None},
             whole,
             waiting,
+            cell.periods if cell else {},
             same,
         )
 
@@ -292,18 +297,17 @@ def _sets_flag(remembered: tuple[EventMemory, EarlyEvent] | None, wait: Waited) 
 def by_regime(
     task: Task,
     rows: Iterable[TrialRow],
-    devices: Mapping[str, str] | None = None,
+    cell: Cell | None = None,
     same: bool = True,
 ) -> dict[str, Training]:
-    """Return the training of each regime of a table. `devices`: the device of each action; `same`:
+    """Return the training of each regime of a table. `cell`: where the task will run; `same`:
     whether the trials are of the task as it is."""
     trials: dict[str, list[Trial]] = {}
     for row in rows:
         if row.trial is not None:
             trials.setdefault(row.regime, []).append(row.trial)
     return {
-        regime: Training.of(task, kept, devices=devices, same=same)
-        for regime, kept in trials.items()
+        regime: Training.of(task, kept, cell=cell, same=same) for regime, kept in trials.items()
     }
 
 
@@ -674,14 +678,11 @@ def read_estimates(path: Path, plant: str | None = None) -> FileContents:
     return kept
 
 
-def trainings_of(
-    task: Task, estimates: Estimates, devices: Mapping[str, str] | None = None
-) -> dict[str, Training]:
-    """Return the training of each regime in an estimates file. `devices`: the device of each
-    action."""
+def trainings_of(task: Task, estimates: Estimates, cell: Cell | None = None) -> dict[str, Training]:
+    """Return the training of each regime in an estimates file. `cell`: where the task will run."""
     regimes = sorted({regime_of(key.context) for key in estimates.tallies})
     return {
-        regime: Training.of(task, _trials(task, estimates, regime), whole=False, devices=devices)
+        regime: Training.of(task, _trials(task, estimates, regime), whole=False, cell=cell)
         for regime in regimes
     }
 

@@ -51,6 +51,8 @@ Row: TypeAlias = int | Codes
 Columns: TypeAlias = slice | Codes
 ALL = slice(None)
 _NEVER, _LEAST = np.iinfo(np.int64).max, np.iinfo(np.int64).min
+ROUNDING = 1e-9
+"""s by which a sum of times may differ from the same time."""
 LONGEST = 10_000
 """Firings at one time, or steps, after which a trial counts as one that never ends."""
 Choices = Mapping[str, Mapping[str, float]]
@@ -161,10 +163,11 @@ class Play:
         replicate: Codes,
         longest: int = LONGEST,
         devices: Mapping[str, str] | None = None,
+        periods: Mapping[str, float] | None = None,
     ) -> None:
         """`longest`: steps (ends of runs and of waits) of a trial at most. `devices`: by action the
-        device for which its runs may have to wait. Raises ValueError for a choice without
-        probabilities."""
+        device for which its runs may have to wait. `periods`: by event that of its timer (s).
+        Raises ValueError for a choice without probabilities."""
         self._longest = longest
         self._s, self._drawer = structure, drawer
         n, places = len(replicate), structure.vocabulary.places
@@ -234,6 +237,9 @@ class Play:
         """By run: its number among those that came, and among those that ended."""
         self._entries = self._ends_so_far = 0
         self._due = np.full((len(self._clocks), n), np.inf)
+        self._periods = periods or {}
+        self._pulses = {event: self._drawer.chance(n) * s for event, s in self._periods.items()}
+        """By event of a timer: when it comes for the first time. A trial may begin at any time."""
         self._odd: dict[str, dict[str, set[int]]] = {}
         self._ways: dict[str, dict[str, int]] = {}
         names, actions = sorted(set((devices or {}).values())), structure.vocabulary.actions
@@ -641,8 +647,17 @@ class Play:
         return able
 
     def _drawn_wait(self, moves: Sequence[Move], columns: Codes) -> Values:
-        drawn = self._drawer.wait([m.name for m in moves], self._replicate[columns])
         move = moves[0]
+        event = next(iter(self._s.task.transitions[move.name].events), "")
+        if (
+            move.memory is not None
+            and event in self._periods
+            and not self._drawer.as_measured(move.name)
+        ):
+            period = self._periods[event]
+            wait = (self._pulses[event][columns] - self._now[columns]) % period
+            return np.where(wait > ROUNDING, wait, wait + period)  # one that comes now has served
+        drawn = self._drawer.wait([m.name for m in moves], self._replicate[columns])
         if drawn is not None:
             return drawn
         if move.transition.after is not None:
@@ -762,6 +777,7 @@ class Play:
         self._seen = self._seen.of(kept)
         for fork in self._forks:
             fork.keep(kept)
+        self._pulses = {event: first[kept] for event, first in self._pulses.items()}
         for name in (
             "_column", "_replicate", "_now", "_begun", "_taken", "_goals", "_good", "_valuation",
         ):  # fmt: skip

@@ -419,9 +419,9 @@ class _SimulatedNet:
         """Play one trial for each entry of `replicate`, a row of `weights`. Raises ValueError for
         what was never measured."""
         drawer = Drawer(self.runs, self._training.waits, weights, random)
-        devices = self._training.devices
+        cell = (self._training.devices, self._training.periods)
         try:
-            return Play(self.structure, drawer, choices, replicate, self._longest, devices).run()
+            return Play(self.structure, drawer, choices, replicate, self._longest, *cell).run()
         except KeyError as fault:
             place, action = fault.args[0]
             names = self._training.vocabulary

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.may_run import Cell
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -589,7 +590,7 @@ def test_runs_wait_for_their_device_as_in_the_engine(
     took = {"a": 1.0, "b": 2.0, "c": 4.0, "d": 8.0}
     trial = by_engine(task, devices, took)
     used = {f"run_{name}": device for name, device in devices.items()}
-    training = Training.of(task, [trial], devices=used)
+    training = Training.of(task, [trial], cell=Cell({}, devices=used))
     random = np.random.default_rng(1)
     drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, 1)), random)
     played = Play(
@@ -608,7 +609,7 @@ def test_waits_of_an_older_table_stay_in_the_durations() -> None:
     task = branches(devices)
     runs = [entry("a", 1.0, taken="a_done"), entry("b", 3.0, taken="b_done")]
     used = {"run_a": "arm", "run_b": "arm"}
-    assert Training.of(task, [Trial(1, 0.0, runs=runs)], devices=used).devices == {}
+    assert Training.of(task, [Trial(1, 0.0, runs=runs)], cell=Cell({}, devices=used)).devices == {}
 
 
 SHARED = """
