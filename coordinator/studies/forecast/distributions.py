@@ -142,8 +142,8 @@ class ContextNode:
     durations: dict[int, ContextNode] = field(default_factory=dict)
     """In a leaf of an outcome tree: the tree of the durations of each outcome."""
     chosen: Mapping[int, Codes] = field(default_factory=dict)
-    """In a leaf of an outcome tree: the action of the latest run in some earlier places, for each
-    member of `ends`."""
+    """In a leaf of an outcome tree: the action of the latest run that began before in some other
+    places, for each member of `ends`."""
 
     def leaves(self) -> list[ContextNode]:
         """Return the leaves below this node."""
@@ -228,7 +228,7 @@ class RunDistributions:
             parts = [runs.of(child == c) for c in range(int(child.max()) + 1)]
             context.children = [self._grow(part, deepest - 1, outcomes=outcomes) for part in parts]
         elif outcomes:
-            context.chosen = {q: ended.seen.action[q] for q in self._chosen}
+            context.chosen = {q: ended.seen.begun[q] for q in self._chosen}
             deepest = DEEPEST if deepest else 0
             for code in np.unique(ended.outcome[ended.outcome != NONE]):
                 context.durations[int(code)] = self._grow(
@@ -498,7 +498,7 @@ class Drawer:
         if not earlier:
             yield columns, {}
             return
-        now = seen.action[np.array(earlier)][:, columns]
+        now = seen.begun[np.array(earlier)][:, columns]
         choices, kind = np.unique(now, axis=1, return_inverse=True)
         for i, choice in enumerate(choices.T.tolist()):
             keys = [(place, action, *pair) for pair in zip(earlier, choice, strict=True)]

@@ -117,6 +117,8 @@ class Seen:
     """Its duration (s); nan if there is none."""
     visits: Codes
     """Number of runs that ended there."""
+    begun: Codes
+    """Action of the latest run that began there, whether it has ended or not."""
 
     @classmethod
     def nothing(cls, q: int, n: int) -> Seen:
@@ -126,12 +128,13 @@ class Seen:
             np.zeros((q, n), np.int64),
             np.full((q, n), np.nan),
             np.zeros((q, n), np.int64),
+            np.zeros((q, n), np.int64),
         )
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Seen:
         """Select columns."""
         parts = self.outcome[:, which], self.action[:, which]
-        return Seen(*parts, self.took[:, which], self.visits[:, which])
+        return Seen(*parts, self.took[:, which], self.visits[:, which], self.begun[:, which])
 
     def note(
         self,
@@ -454,6 +457,8 @@ def as_arrays(
             for i in _ended_before(flat, j, begin):
                 run = flat[i][1]
                 seen.note(places[run.place], j, codes[i], actions.get(run.action, 0), took[i])
+            for _, run in flat[begin:j]:
+                seen.begun[places[run.place], j] = actions.get(run.action, 0)
         begin = end
     return Runs(
         np.array([places[run.place] for _, run in flat], np.int64),

@@ -598,6 +598,7 @@ class Play:
         which = np.searchsorted(bounds, self._drawer.chance(len(columns)), side="right")
         action = codes[np.minimum(which, len(codes) - 1)]
         ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
+        self._seen.begun[q, columns] = action
         status, taken = self._s.vocabulary.parts(ends.outcome)
         now = self._now[columns]
         self._phase[run, columns] = GOING

@@ -213,7 +213,8 @@ def exact(
 def contradictions(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str]:
     """Return in words where simulated net and stochastic view contradict each other, if no trial
     tells which of them is right: by more than fitted durations explain."""
-    tested = said["whole"] and said["same"] and not said["asked"] and not said.get("what_if")
+    # the view does not know what a choice does to the runs of other places
+    tested = said["whole"] and (said["asked"] or (said["same"] and not said.get("what_if")))
     if said["from"] != NET or tested or "why" in view:
         return []
     out = []

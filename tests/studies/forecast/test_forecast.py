@@ -376,8 +376,9 @@ QUALITY = {
 """How much each choice multiplies the chance to hold the part."""
 
 
-def steps(n: int, random: np.random.Generator) -> list[Trial]:
-    """Draw trials that choose at random; only the last step shows how good all choices were."""
+def steps(n: int, random: np.random.Generator, plan: float = 1.0) -> list[Trial]:
+    """Draw trials that choose at random; only the last step shows how good all choices were.
+    `plan`: seconds that planning takes."""
     out = []
     for _ in range(n):
         chosen = {place: int(random.integers(len(q))) for place, q in QUALITY.items()}
@@ -388,7 +389,8 @@ def steps(n: int, random: np.random.Generator) -> list[Trial]:
             status, taken = "success", ("seen", "planned", "done")[i]
             if place == "grasp" and not held:
                 status, taken = "error", "dropped"
-            runs.append(RunEntry(place, f"{place}_{k}", 1.0 * i, 1.0, status, taken=taken))
+            took = plan if place == "plan" else 1.0
+            runs.append(RunEntry(place, f"{place}_{k}", 1.0 * i, took, status, taken=taken))
         out.append(Trial(1, 0.0, 3.0, True, int(held), runs[-1].status, "", runs, []))
     return out
 
@@ -413,6 +415,25 @@ def test_a_combination_that_few_trials_made_is_forecast_from_what_each_choice_do
         low <= truth <= high for low, high in (o["figures"]["R_goal"]["confidence"] for o in found)
     )
     assert np.mean(values) == pytest.approx(truth, abs=0.045) and held >= 6
+
+
+def test_a_choice_counts_while_its_run_is_still_active() -> None:
+    """The arm grasps while the camera still tracks: what tracks decides what is held."""
+    beside = (
+        STEPS.replace(
+            'in = ["look:normal"]\nout = ["plan"]', 'in = ["look:normal"]\nout = ["plan", "grasp"]'
+        )
+        .replace('in = ["plan:normal"]\nout = ["grasp"]', 'in = ["plan:normal"]\nout = []')
+        .replace('in = ["plan:error"]\nout = ["free"]', 'in = ["plan:error"]\nout = []')
+    )
+    task, found = loads(beside, "steps.toml"), []
+    for seed in range(3):
+        trained = steps(600, np.random.default_rng(seed), plan=1.5)
+        choices = {**choices_of(Training.of(task, trained)), "plan": {"plan_1": 1.0}}
+        found.append(forecast(task, trained, choices=choices, net=True))
+    mean = float(np.mean(QUALITY["look"]) * np.mean(QUALITY["grasp"]))
+    values = [one["figures"]["R_goal"]["value"] for one in found]
+    assert np.mean(values) == pytest.approx(0.85 * mean, abs=0.02)
 
 
 def test_a_change_by_nothing_changes_nothing() -> None:

@@ -245,7 +245,7 @@ def test_the_order_of_few_trials_is_judged_as_by_all_their_orders(swapped: tuple
     ],
 )
 @pytest.mark.parametrize(
-    "untested", [{"same": False}, {"what_if": ["a.mean*=2"]}, {"asked": ["a"]}]
+    "untested", [{"same": False}, {"what_if": ["a.mean*=2"]}, {"whole": False}]
 )
 def test_two_views_that_contradict_each_other_are_doubtful_where_no_trial_tells(
     other: dict[str, Any], contradicts: list[str], untested: dict[str, Any]
@@ -261,4 +261,5 @@ def test_two_views_that_contradict_each_other_are_doubtful_where_no_trial_tells(
     for text, words in zip(found, contradicts, strict=True):
         assert words in text
     assert not contradictions(said, values | other), "the trials tell"
+    assert not contradictions(said | {"asked": ["a"]}, values | other), "the view does not know"
     assert not contradictions(said | untested, {"why": "not solved"})
