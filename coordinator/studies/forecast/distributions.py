@@ -450,8 +450,8 @@ class Ends:
 FEWEST_WAYS = 30
 """Least number of firings from which the way that tokens take depends on how many came before."""
 Branches = Mapping[tuple[int, ...], Values]
-"""How often each alternative fired (replicates, alternatives): after which other one (-1: none),
-and as the how-manieth in its trial (from 0); by the first alone; by neither."""
+"""How often each alternative fired (replicates, alternatives), by (the one that fired before, or
+-1; its number in the trial, from 0), by the first of these alone, and by ()."""
 
 
 class Drawer:

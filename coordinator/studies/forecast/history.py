@@ -118,7 +118,7 @@ class Seen:
     visits: Codes
     """Number of runs that ended there."""
     begun: Codes
-    """Action of the latest run that began there, whether it has ended or not."""
+    """Action of the latest run that began there; it may still be active."""
 
     @classmethod
     def nothing(cls, q: int, n: int) -> Seen:
@@ -457,7 +457,9 @@ def as_arrays(
             for i in _ended_before(flat, j, begin):
                 run = flat[i][1]
                 seen.note(places[run.place], j, codes[i], actions.get(run.action, 0), took[i])
-            for _, run in flat[begin:j]:
+            if j > begin:
+                run = flat[j - 1][1]
+                seen.begun[:, j] = seen.begun[:, j - 1]
                 seen.begun[places[run.place], j] = actions.get(run.action, 0)
         begin = end
     return Runs(

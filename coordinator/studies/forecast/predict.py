@@ -69,7 +69,7 @@ NO_TRIALS = (
 )
 CHANGED = (
     "what if: the figures come from the simulated net, and no trial tests the changes: {}; runs "
-    "that depend on each other go on doing so as in the training"
+    "depend on each other as in the training"
 )
 OTHER_FORM = (
     "the campaign ran another form of this task: the figures come from the simulated net, and no "
