@@ -89,6 +89,8 @@ class Operation:
         self.feed = shown.publisher.feed if shown is not None else feed or Feed()
         self.controls = controls or Controls(self.feed)
         self._refusals: list[str] = []
+        self._unanswered: set[asyncio.Future[Answer]] = set()
+        """Answers that wait until their commands are journaled."""
         self._holding: dict[str, str] = {}
         """Runs that have not answered yet whether they hold, each with its node."""
         self._all_held = asyncio.Event()
@@ -122,6 +124,8 @@ class Operation:
     async def close(self) -> None:
         """Stop asking the nodes."""
         self.feed.clock = None
+        for answer in tuple(self._unanswered):
+            answer.set_result(refusal("journal", "the run ended before this was in its journal"))
         if self._stopping is not None:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
@@ -193,7 +197,7 @@ class Operation:
 
     async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
         paused = self.executor.state.mode is Mode.PAUSED  # then only ask again who holds
-        answer = {"ok": True} if paused else self._order(Pause(f"by {who}"))
+        answer = {"ok": True} if paused else await self._order(Pause(f"by {who}"))
         if answer["ok"]:
             with suppress(TimeoutError):
                 async with asyncio.timeout(ANSWERS):
@@ -215,15 +219,15 @@ class Operation:
             self.feed.emit("paused", paused={**paused, "nodes": nodes})
 
     async def _do_resume(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(Resume())
+        return await self._order(Resume())
 
     async def _do_step(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(Step())
+        return await self._order(Step())
 
     async def _do_abort(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self.abort(f"by {who}")
+        return await self.abort(f"by {who}")
 
-    def abort(self, reason: str) -> Answer:
+    def abort(self, reason: str) -> asyncio.Future[Answer]:
         """Abort the run, regardless of the controls."""
         return self._order(Abort(reason))
 
@@ -231,23 +235,23 @@ class Operation:
         name = str(data["element"]).partition(".")[2]
         names = set(self.executor.state.breakpoints)
         (names.add if data.get("on", True) else names.discard)(name)
-        return self._order(SetBreakpoints(tuple(sorted(names))))
+        return await self._order(SetBreakpoints(tuple(sorted(names))))
 
     async def _do_add_tokens(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(AddTokens(str(data["place"]), int(data.get("count", 1))))
+        return await self._order(AddTokens(str(data["place"]), int(data.get("count", 1))))
 
     async def _do_remove_tokens(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(RemoveTokens(str(data["place"]), int(data.get("count", 1))))
+        return await self._order(RemoveTokens(str(data["place"]), int(data.get("count", 1))))
 
     async def _do_raise_event(self, who: str, data: Mapping[str, Any]) -> Answer:
         name = str(data["event"])
         event = self.executor.task.flat.events.get(name)
         if event is None or event.scope is not Scope.EXTERNAL:
             return refusal("refused", f"{name} is not an external event of the task")
-        return self._order(RaiseEvent(name))
+        return await self._order(RaiseEvent(name))
 
     async def _do_force_exit(self, who: str, data: Mapping[str, Any]) -> Answer:
-        return self._order(ForceExit(str(data["transition"])))
+        return await self._order(ForceExit(str(data["transition"])))
 
     async def _do_override_selector(self, who: str, data: Mapping[str, Any]) -> Answer:
         task, action = str(data["primitive_task"]), data.get("action")
@@ -257,7 +261,7 @@ class Operation:
                 "refused",
                 f"{action} is not an alternative of {task}: {', '.join(primitive.alternatives)}",
             )
-        return self._order(Override(task, action or ""))
+        return await self._order(Override(task, action or ""))
 
     async def _do_remark(self, who: str, data: Mapping[str, Any]) -> Answer:
         store, now = self.executor.store, self.shell.now()
@@ -269,16 +273,45 @@ class Operation:
             )
         try:
             remark = store.remark(now, who, data["text"])
-            store.sync()
+            journaled = self._when_safe({"ok": True})
         except JournalError as fault:
             self.shell.fail(fault)
             return refusal("journal", str(fault))
-        time = round(mission_time(now, self.publisher.origin), 4)
-        notice = {"level": "info", "text": remark.told, "at": time}
-        self.feed.emit("notice", time=time, notice=notice)
-        return {"ok": True}
+        answer = await journaled
+        if answer["ok"]:
+            time = round(mission_time(now, self.publisher.origin), 4)
+            notice = {"level": "info", "text": remark.told, "at": time}
+            self.feed.emit("notice", time=time, notice=notice)
+        return answer
 
-    def _order(self, stimulus: Stimulus) -> Answer:
+    def _order(self, stimulus: Stimulus) -> asyncio.Future[Answer]:
+        """Give a stimulus to the engine; its answer comes when it is journaled."""
+        refused = self._refused(stimulus)
+        if refused is None:
+            self._refusals.clear()
+            try:
+                self.executor.stimulate(self.shell.now(), stimulus)
+                said = refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
+                return self._when_safe(said)
+            except JournalError as fault:
+                self.shell.fail(fault)
+                refused = refusal("journal", str(fault))
+        answer = asyncio.get_running_loop().create_future()
+        answer.set_result(refused)
+        return answer
+
+    def _when_safe(self, said: Answer) -> asyncio.Future[Answer]:
+        """Return an answer that is given when all until now is journaled."""
+        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._unanswered.add(answer)
+        answer.add_done_callback(self._unanswered.discard)
+        self.executor.when_safe(
+            self.shell.now(), lambda _: None if answer.done() else answer.set_result(said)
+        )
+        self.shell.settle()
+        return answer
+
+    def _refused(self, stimulus: Stimulus) -> Answer | None:
         early = self.mission.stage in _BEFORE and isinstance(stimulus, _MAY_COME_EARLY)
         if self.mission.stage is not Stage.RUNNING and not early:
             return refusal("idle", f"the mission run is {self.mission.stage.value}")
@@ -287,27 +320,20 @@ class Operation:
         except (OverflowError, UnicodeEncodeError) as fault:
             remedy = "a smaller number" if isinstance(fault, OverflowError) else "Unicode text"
             return refusal("bad_data", f"no journal can store this: {fault}; give {remedy}")
-        self._refusals.clear()
-        try:
-            self.executor.stimulate(self.shell.now(), stimulus)
-            self.executor.store.sync()
-        except JournalError as fault:
-            self.shell.fail(fault)
-            return refusal("journal", str(fault))
-        self.shell.settle()
-        return refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
+        return None
 
     # --- directly to the nodes ----------------------------------------------------------------
 
     async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         for node in self.mission.callers:
             self.watching.ask(node, STOP)
-        answer = self._order(Abort(f"emergency stop by {who}"))
+        journaled = self._order(Abort(f"emergency stop by {who}"))
         self.feed.emit(
             "mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"}
         )
         if self._live and (self._stopping is None or self._stopping.done()):
             self._stopping = asyncio.get_running_loop().create_task(self._stop_again())
+        answer = await journaled
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
 
     async def _stop_again(self) -> None:

@@ -1,8 +1,9 @@
 """The executor: passes stimuli to the engine and carries out its instructions.
 
 A sans-I/O machine: `take` receives what a caller noticed, `advance` moves it to a time, and its
-calls are in its callers. Every stimulus is stored before its effects leave, and effects leave after
-the store's `sync`.
+calls are in its callers. Every stimulus is stored before its effects leave, and what moves hardware
+leaves after a sync of the store. `in_background` may do that elsewhere: a disk may need seconds,
+and the coordinator must answer its nodes and operators meanwhile.
 """
 
 from __future__ import annotations
@@ -67,7 +68,8 @@ MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
 """Time after which records are synced even if no effect needs that (s), so that nodes may forget
 results."""
-_LEAVES_THE_PROCESS: Final = (StartRun, CancelRun, HoldRun, ReleaseRun)
+_Order = StartRun | CancelRun | HoldRun | ReleaseRun
+"""Instructions that leave the process."""
 
 
 @dataclass
@@ -86,6 +88,9 @@ class Executor:
     finished: Finished | None = None
     on_status: Callable[[Mapping[str, Any]], None] | None = None
     """Receives the nodes' answers to the operator's questions."""
+    in_background: Callable[[Callable[[], None]], None] | None = None
+    """Does what makes the store durable in another thread, then calls `synced`. None: it is done at
+    once."""
 
     def __post_init__(self) -> None:
         """Start with the engine's initial state."""
@@ -93,8 +98,13 @@ class Executor:
         self.dispatch = Dispatch(self.directory, self.callers, self.mission, self.seed)
         self._queue: deque[Stimulus] = deque()
         self._effects: list[Instruction] = []
-        self._acks: list[Callable[[], None]] = []
+        self._when_safe: list[Callable[[float], None]] = []
+        """What is done when all that was appended is durable."""
+        self._sync_wanted = False
+        self._syncing: tuple[list[Instruction], list[Callable[[float], None]]] | None = None
+        """Effects, and what else waits for the sync that is under way; None: there is none."""
         self._unsafe_since: float | None = None
+        """Since when a record has waited for the begin of a sync (s)."""
         self._external = {
             e.name for e in self.task.flat.events.values() if e.scope is Scope.EXTERNAL
         }
@@ -174,56 +184,106 @@ class Executor:
     def due(self) -> float | None:
         """Return when `advance` is needed next."""
         due = self.dispatch.due()
-        if self._unsafe_since is None:
+        if self._unsafe_since is None or self._syncing is not None:
             return due
         safe_by = self._unsafe_since + SYNC_WITHIN
         return safe_by if due is None else min(due, safe_by)
 
+    def when_safe(self, now: float, then: Callable[[float], None]) -> None:
+        """Call `then`, with the time, when all that was appended is durable."""
+        self._when_safe.append(then)
+        self._sync_wanted = True
+        self._work(now)
+
+    def synced(self, now: float) -> None:
+        """The sync that `in_background` was given has ended: let leave what waited for it."""
+        assert self._syncing is not None
+        (effects, then), self._syncing = self._syncing, None
+        for call in then:
+            call(now)
+        self._let_leave(now, effects)
+        self._work(now)
+
+    @property
+    def over(self) -> bool:
+        """Whether the net has finished, and all that led to it is durable."""
+        return self.finished is not None and self._syncing is None and self.store.safe
+
     # --- one stimulus after the other ---------------------------------------------------------
 
     def _work(self, now: float) -> None:
-        while self._queue:
+        while True:
             while self._queue:
                 self._handle(now, self._queue.popleft())
-            self._make_safe(now)
-            effects, self._effects = self._effects, []
-            for instruction in effects:
-                if (
-                    isinstance(instruction, CancelRun)
-                    and instruction.run not in self.state.stopping
-                ):
-                    continue  # it ended in the same turn
-                self._queue.extend(self.dispatch.carry_out(now, instruction))
-        self._make_safe(now)
+            effects = self._safe_effects(now)
+            if not effects:
+                return
+            self._let_leave(now, effects)
 
-    def _make_safe(self, now: float) -> None:
-        """Store records before their effects leave: synced if an effect moves hardware or ends the
-        run, otherwise so that they survive this process.
+    def _let_leave(self, now: float, effects: Iterable[Instruction]) -> None:
+        for instruction in effects:
+            if isinstance(instruction, CancelRun) and instruction.run not in self.state.stopping:
+                continue  # it ended in the same turn
+            self._queue.extend(self.dispatch.carry_out(now, instruction))
 
-        Independent effects of one turn share one sync. What waits is synced within `SYNC_WITHIN`,
-        and acknowledged then.
+    def _safe_effects(self, now: float) -> list[Instruction]:
+        """Store records, and return the effects that may leave: after a sync if an effect moves
+        hardware or ends the mission run, otherwise when the records survive this process.
+
+        Effects of one turn share one sync, and while it is under way others gather for the next.
+        What waits is synced within `SYNC_WITHIN`, and acknowledged then.
         """
-        if self.store.safe:
-            self._unsafe_since = None
-            self._acknowledge()
-            return
-        leaving = [effect for effect in self._effects if isinstance(effect, _LEAVES_THE_PROCESS)]
-        moves = any(
-            self.store.durable or self.dispatch.moves_hardware(effect) for effect in leaving
-        )
-        waited = self._unsafe_since is not None and now >= self._unsafe_since + SYNC_WITHIN
-        if moves or waited or self.finished is not None:
-            self.store.sync()
-            self._unsafe_since = None
-            self._acknowledge()
-        else:
-            self.store.flush()
-            self._unsafe_since = now if self._unsafe_since is None else self._unsafe_since
+        effects, self._effects = self._effects, []
+        if self._syncing is None:
+            waited = self._unsafe_since is not None and now >= self._unsafe_since + SYNC_WITHIN
+            if (
+                self.store.safe
+                or waited
+                or self._sync_wanted
+                or self.finished is not None
+                or any(self._needs_sync(effect) for effect in effects)
+            ):
+                return self._sync(now, effects)
+        self.store.flush()
+        if self._unsafe_since is None and not self.store.safe:
+            self._unsafe_since = now
+        leaving, self._effects = self._split(effects)
+        return leaving
 
-    def _acknowledge(self) -> None:
-        acks, self._acks = self._acks, []
-        for acknowledge in acks:
-            acknowledge()
+    def _sync(self, now: float, effects: list[Instruction]) -> list[Instruction]:
+        """Make all that was appended durable, or begin to. Return the effects that may leave."""
+        self._unsafe_since, self._sync_wanted = None, False
+        then, self._when_safe = self._when_safe, []
+        if not self.store.safe:
+            sync = self.store.begin_sync()
+            if self.in_background is not None:
+                leaving, waiting = self._split(effects)
+                self._syncing = waiting, then
+                self.in_background(sync)
+                return leaving
+            sync()
+        for call in then:
+            call(now)
+        return effects
+
+    def _needs_sync(self, effect: Instruction) -> bool:
+        return isinstance(effect, _Order) and (
+            self.store.durable or self.dispatch.moves_hardware(effect)
+        )
+
+    def _split(self, effects: Iterable[Instruction]) -> tuple[list[Instruction], list[Instruction]]:
+        """Return the effects that may leave without a sync, and those that wait for one: orders to
+        a device, and any behind another order about the same run."""
+        before = [] if self._syncing is None else self._syncing[0]
+        runs = {effect.run for effect in before if isinstance(effect, _Order)}
+        leaving, waiting = list[Instruction](), list[Instruction]()
+        for effect in effects:
+            if isinstance(effect, _Order) and (effect.run in runs or self._needs_sync(effect)):
+                runs.add(effect.run)
+                waiting.append(effect)
+            else:
+                leaving.append(effect)
+        return leaving, waiting
 
     def _handle(self, now: float, stimulus: Stimulus) -> None:
         for observer in self.observers:
@@ -268,7 +328,7 @@ class Executor:
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
         self._abort_if_latched(now, node, outcome)
-        self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
+        self._when_safe.append(lambda at: self.callers[node].acknowledge(at, outcome.id))
         self._queue.extend(self.dispatch.ended(now, outcome))
 
     def _abort_if_latched(self, now: float, node: str, outcome: Outcome) -> None:
@@ -286,7 +346,7 @@ class Executor:
 
     def _event(self, now: float, node: str, event: Event) -> None:
         if event.number:
-            self._acks.append(lambda: self.callers[node].acknowledge_event(now, event))
+            self._when_safe.append(lambda at: self.callers[node].acknowledge_event(at, event))
         if event.name == STOP_EVENT:
             self._abort(now, node)
         elif event.name.startswith(MEMORY_EVENTS):

@@ -3,7 +3,7 @@ each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from petrobot.coordinator.engine import Instruction, State, Stimulus
@@ -39,12 +39,13 @@ class Store(Protocol):
     def flush(self) -> None:
         """Make all that was appended survive the end of this process."""
 
-    def sync(self) -> None:
-        """Make all that was appended durable."""
+    def begin_sync(self) -> Callable[[], None]:
+        """Return what makes all durable that has been appended: it may take seconds, and may be
+        done in another thread."""
 
     @property
     def safe(self) -> bool:
-        """Whether nothing waits for a sync."""
+        """Whether all that was appended is durable."""
 
     @property
     def durable(self) -> bool:
@@ -85,8 +86,9 @@ class Forgetful:
     def flush(self) -> None:
         """Nothing to flush."""
 
-    def sync(self) -> None:
+    def begin_sync(self) -> Callable[[], None]:
         """Nothing to make safe."""
+        return lambda: None
 
 
 class FirstAlternative:

@@ -21,8 +21,9 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,9 @@ class JournalWriter:
         self.path = path
         self._at = path.absolute()  # an action in this process may change the working directory
         self._buffer = bytearray()
-        self._unsynced = False
-        """Whether records were handed to the operating system since the last sync."""
+        self._written = self._durable = 0
+        """How often records were handed to the operating system, and how many of these times are
+        durable."""
         self._torn: int | None = None
         """Where to cut the file before anything is appended; None: nowhere."""
         self.syncs = 0
@@ -166,7 +168,7 @@ class JournalWriter:
     @property
     def pending(self) -> bool:
         """Whether records wait for the next sync."""
-        return bool(self._buffer) or self._unsynced
+        return bool(self._buffer) or self._durable < self._written
 
     @property
     def unsaved(self) -> bool:
@@ -178,7 +180,7 @@ class JournalWriter:
         cut. Raises JournalError, also if the file is no longer where a resume would look for it."""
         if not self._buffer:
             return
-        self._unsynced = True
+        self._written += 1
         try:
             if self._torn is not None:
                 os.ftruncate(self._file, self._torn)
@@ -202,8 +204,16 @@ class JournalWriter:
 
     def sync(self) -> None:
         """Make all that was appended durable; does nothing if it already is."""
+        self.begin_sync()()
+
+    def begin_sync(self) -> Callable[[], None]:
+        """Write what was appended, and return what makes it durable: that may take seconds, and may
+        be done in another thread. Both raise JournalError."""
         self.flush()
-        if self._unsynced:
+        return partial(self._sync, self._written)
+
+    def _sync(self, written: int) -> None:
+        if self._durable < written:
             try:
                 os.fdatasync(self._file)
             except OSError as fault:
@@ -211,7 +221,7 @@ class JournalWriter:
                     f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
                 ) from fault
             self.syncs += 1
-            self._unsynced = False
+            self._durable = max(self._durable, written)
 
     def close(self) -> None:
         """Sync and close; the file is closed even if the sync fails."""

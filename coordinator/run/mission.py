@@ -402,8 +402,7 @@ class Mission:
             notices = [notice for notice in notices if isinstance(notice, Welcome | PeerLost)]
         own = [n for n in notices if isinstance(n, Outcome) and self._is_own(n)]
         for notice in own:
-            self._answered(now, notice)
-            self.callers[node].acknowledge(now, notice.id)
+            self._answered(now, node, notice)
         self.executor.take(now, node, [n for n in notices if n not in own])
         self.advance(now)
 
@@ -411,8 +410,13 @@ class Mission:
         """Do what is due."""
         if self.stage is Stage.RUNNING:
             self.executor.advance(now)
-            if self.executor.finished is not None:
+            if self.executor.over:
                 self._finish(now, now)
+
+    def synced(self, now: float) -> None:
+        """Continue when a sync in the background has ended."""
+        self.executor.synced(now)
+        self.advance(now)
 
     def due(self) -> float | None:
         """Return when `advance` is needed next."""
@@ -521,26 +525,31 @@ class Mission:
     def _is_own(self, outcome: Outcome) -> bool:
         return outcome.id in (f"{self.executor.mission}/prepare", f"{self.executor.mission}/score")
 
-    def _answered(self, now: float, outcome: Outcome) -> None:
+    def _answered(self, now: float, node: str, outcome: Outcome) -> None:
         if outcome.status != Status.SUCCESS:
             what = outcome.id.rpartition("/")[2]
             raise MissionError(
                 f"{what}: {outcome.text or outcome.cause}",
                 bad_input=outcome.cause == "bad_arguments",
             )
-        store = self.executor.store
-        if self.stage is Stage.PREPARING:
+        store, stage = self.executor.store, self.stage
+        score = {key: value for key, value in outcome.values.items() if key != VERDICTS}
+        if stage is Stage.PREPARING:
             store.record(STAGE, {"stage": PREPARED, "values": {}})
-            store.sync()
-            self._begin(now)
-        elif self.stage is Stage.SCORING:
-            score = {key: value for key, value in outcome.values.items() if key != VERDICTS}
+        elif stage is Stage.SCORING:
             self.executor.stimulate(
                 now, *map(self.executor.verdict, _verdicts(outcome.values.get(VERDICTS, {})))
             )
             store.record(STAGE, {"stage": SCORED, "values": dict(score)})
-            store.sync()
-            self.score, self.stage = score, Stage.OVER
+
+        def safe(now: float) -> None:
+            if stage is self.stage is Stage.PREPARING:
+                self._begin(now)
+            elif stage is self.stage is Stage.SCORING:
+                self.score, self.stage = score, Stage.OVER
+            self.callers[node].acknowledge(now, outcome.id)
+
+        self.executor.when_safe(now, safe)
 
     def _refuse_to_begin(self, node: str, notices: Sequence[Notice]) -> None:
         """Raise MissionError if the task has not begun, and a node reports an emergency stop, or

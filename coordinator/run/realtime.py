@@ -9,6 +9,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from shlex import quote
@@ -143,6 +144,9 @@ class RealtimeMission:
         self._lost_at: dict[str, float] = {}
         self._punctuality = Punctuality()
         self._looking: asyncio.TimerHandle | None = None
+        self._disk = ThreadPoolExecutor(1, "journal")
+        self._syncing: asyncio.Future[None] | None = None
+        mission.executor.in_background = self._sync
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
             name: Client(
@@ -296,6 +300,9 @@ class RealtimeMission:
         for timer in (self._timer, self._looking):
             if timer is not None:
                 timer.cancel()
+        if self._syncing is not None:
+            await asyncio.wait({self._syncing})
+        self._disk.shutdown()
         await asyncio.gather(*(self._leave(name, client) for name, client in self.clients.items()))
 
     async def _leave(self, name: str, client: Client) -> None:
@@ -331,6 +338,17 @@ class RealtimeMission:
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
+
+    def _sync(self, work: Callable[[], None]) -> None:
+        """Make the journal durable in a thread."""
+        self._syncing = self._loop.run_in_executor(self._disk, work)
+        self._syncing.add_done_callback(self._synced)
+
+    def _synced(self, done: asyncio.Future[None]) -> None:
+        if (fault := done.exception()) is not None:
+            self.fail(fault)
+        elif not self._closed and self._fault is None:
+            self._guarded(self.mission.synced)
 
     def _look_again(self, due: float) -> None:
         """Measure how late the loop is: if it is late, so are the other processes of this host."""

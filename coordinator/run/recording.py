@@ -13,7 +13,7 @@ import math
 import time
 import zlib
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -146,13 +146,13 @@ class JournalStore:
         """Make all that was appended survive the end of this process."""
         self.writer.flush()
 
-    def sync(self) -> None:
-        """Make all that was appended durable."""
-        self.writer.sync()
+    def begin_sync(self) -> Callable[[], None]:
+        """Return what makes all durable that has been appended."""
+        return self.writer.begin_sync()
 
     @property
     def safe(self) -> bool:
-        """Whether nothing waits for a sync."""
+        """Whether all that was appended is durable."""
         return not self.writer.pending
 
 

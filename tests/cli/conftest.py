@@ -55,6 +55,7 @@ class Terminal:
         robot: RobotNode,
         folder: Path,
         read: Callable[[], Any],
+        running: asyncio.Task[None],
     ):
         self.operation = operation
         self.shell = shell
@@ -63,6 +64,7 @@ class Terminal:
         self.folder = folder
         self.runs = folder / "runs"
         self._read = read
+        self.running = running
 
     @property
     def mission(self) -> Mission:
@@ -118,7 +120,7 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     running = asyncio.create_task(shell.run())
     address = RunAddress(RUN, page.base, page.token, os.getpid(), str(directory.source))
     with published(journal.parent, address):
-        yield Terminal(operation, shell, page, robot, folder, read)
+        yield Terminal(operation, shell, page, robot, folder, read, running)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
     await page.close()

@@ -4,10 +4,12 @@ refused."""
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import os
 import stat
 import subprocess
+import threading
 import time
 from pathlib import Path
 
@@ -24,12 +26,12 @@ from petrobot.coordinator.operator.run_address import (
 )
 from petrobot.coordinator.page import app_state
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
-from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.journal import JournalError, JournalWriter, read_journal
 from petrobot.coordinator.run.recording import remarks
 from petrobot.services.comm.location_file import load
 from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
-from tests.waiting import beat, until
+from tests.waiting import PATIENCE_S, beat, until
 
 STEERING = ["watch", *(one.name for one in COMMANDS if one.home.startswith("operate:"))]
 
@@ -129,6 +131,51 @@ async def test_a_node_that_is_frozen_counts_as_lost(petrobot: Terminal) -> None:
     for _ in range(2):  # also when it was paused already
         said = await petrobot("pause", "--json", "-")
         assert (said.code, said.json["nodes"]) == (3, {"robot": "lost"})
+
+
+async def test_a_slow_disk_delays_the_robot_and_not_the_coordinator(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A memory card may need seconds for a sync. Nodes and operators are answered meanwhile."""
+    goes_on, syncs = threading.Event(), []
+
+    def fdatasync(file: int) -> None:
+        syncs.append(file)
+        assert goes_on.wait(PATIENCE_S)
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    try:
+        raising = asyncio.create_task(petrobot("raise", "part_there"))
+        await until(lambda: syncs)
+        assert (await petrobot("break")).code == 0
+        pausing = asyncio.create_task(petrobot("pause"))
+        await until(lambda: petrobot.mission.executor.state.mode is Mode.PAUSED)
+        await asyncio.sleep(1.5)  # longer than a node is silent before it counts as lost
+        assert not petrobot.mission.lost and not petrobot.arm.moving
+        assert not raising.done() and not pausing.done(), "what is not on disk is not confirmed"
+    finally:
+        goes_on.set()
+    assert ((await raising).code, (await pausing).code) == (0, 0)
+    assert (await petrobot("continue")).code == 0
+    await until(lambda: petrobot.arm.moving)
+
+
+async def test_a_command_is_answered_when_the_run_ends_before_its_disk_has_written(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails in the middle of a sync."""
+
+    def fdatasync(file: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    raising = asyncio.create_task(petrobot("raise", "part_there"))
+    with pytest.raises(JournalError, match="Input/output error; nothing was sent"):
+        await asyncio.wait_for(petrobot.running, PATIENCE_S)
+    await petrobot.operation.close()
+    said = await raising
+    assert said.code == 1 and "ended before this was in its journal" in said.err, said
+    assert not petrobot.arm.moving
 
 
 async def test_a_node_without_active_runs_is_idle_in_a_pause(petrobot: Terminal) -> None:

@@ -82,12 +82,16 @@ class MortalStore(JournalStore):
         if unsaved:
             self.count()
 
-    def sync(self) -> None:
-        """Sync, and count it."""
-        pending = self.writer.pending
-        super().sync()
-        if pending:
+    def begin_sync(self) -> Callable[[], None]:
+        """Write, and count it and its sync."""
+        self.flush()
+        work = super().begin_sync()
+
+        def sync() -> None:
+            work()
             self.count()
+
+        return sync
 
 
 def counting(directory: Directory, log: Path) -> dict[str, Callable[..., Any]]:

@@ -579,7 +579,7 @@ def test_a_resumed_mission_restores_its_selector(tmp_path: Path) -> None:
     }
     store = JournalStore(JournalWriter(tmp_path / "run.journal", header), 0.0)
     run(task, session.selector, runs=9, seed=5, store=store)
-    store.sync()
+    store.writer.sync()
     whole = (tmp_path / "run.journal").read_bytes()
     (tmp_path / "half.journal").write_bytes(whole[: len(whole) // 2])
     journal = read_journal(tmp_path / "half.journal")

@@ -154,7 +154,7 @@ def test_replay_restores_the_same_state(task: Task, tmp_path: Path) -> None:
     store = JournalStore(JournalWriter(path, {"mission": "m", "mode": "lockstep"}), 0.0)
     live = learner(task, seed=4)
     run(task, live, runs=15, seed=4, store=store)
-    store.sync()
+    store.writer.sync()
     known, _ = with_runs(task, 15)
     devices: Mapping[str, str] = {
         a.name: a.device for a in directory(task).actions.values() if a.device

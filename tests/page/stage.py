@@ -325,7 +325,7 @@ class Stage:
                 queue.extend(self._carry_out(instruction))
             self.publisher.settled(self.clock, self.state)
         if self._store is not None:
-            self._store.sync()
+            self._store.writer.sync()
 
     def _carry_out(self, instruction: Instruction) -> list[Stimulus]:
         match instruction:

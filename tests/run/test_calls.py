@@ -4,6 +4,7 @@ with one coordinator process or after a resume."""
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Executed, Status
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Message
 from tests.run.toy_arm import TIDY, WORK, Bench, directory
 
 STOPPED = "preempted by rung"
@@ -345,18 +347,67 @@ def test_nothing_is_sent_if_the_journal_cannot_be_written(tmp_path: Path) -> Non
     assert bench.calls() == []
 
 
-def test_after_a_sync_from_outside_no_sync_is_due(tmp_path: Path) -> None:
-    """The operator's session syncs the operator's commands itself; afterwards the executor has no
-    sync to wake up for."""
+def test_after_a_sync_that_was_asked_for_none_is_due(tmp_path: Path) -> None:
+    """The answer to an operator's command waits for a sync; afterwards the executor has none to
+    wake up for."""
     store = JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0)
     bench = Bench(store=store)
     bench.link(0.0)
     bench.executor.stimulate(0.0, Begin())
     bench.executor.stimulate(0.1, Pause("by hand"))
-    store.sync()
+    safe: list[float] = []
+    bench.executor.when_safe(0.1, safe.append)
+    assert safe == [0.1]
     bench.go(0.7)
     due = bench.executor.due()
     assert store.safe and (due is None or due > 0.7)
+
+
+def test_what_comes_while_the_disk_is_slow_waits_for_the_next_sync(tmp_path: Path) -> None:
+    """The bell rings while the start of `work` is not yet on disk: start, then stop."""
+    syncs: list[Callable[[], None]] = []
+    bench = Bench(store=JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0))
+    bench.executor.in_background = syncs.append
+
+    def disk_has_written(now: float) -> list[Message]:
+        (sync,) = syncs
+        syncs.clear()
+        sync()
+        bench.executor.synced(now)
+        return bench.sent(m.Call, m.Cancel, m.EventAck, m.ResultAck)
+
+    bench.link(0.0)
+    bench.sent()
+    bench.executor.stimulate(0.0, Begin())
+    bench.ring(0.1)
+    bench.go(2.0)
+    assert not bench.sent(m.Call, m.Cancel, m.EventAck)
+    due = bench.executor.due()
+    assert due is None or due > 2.0, "nothing but the end of the sync may wake it"
+    assert [type(message) for message in disk_has_written(2.0)] == [m.Call]
+    assert {type(message) for message in disk_has_written(4.0)} == {m.Cancel, m.EventAck}
+    bench.say(4.1, m.Outcome(WORK, "error", {}, "cancelled"))
+    assert disk_has_written(5.0)
+    bench.say(5.1, m.Accept(TIDY), m.Outcome(TIDY, "success"))
+    assert bench.executor.finished and not bench.executor.over
+    disk_has_written(6.0)
+    assert bench.executor.over
+
+
+def test_only_what_moves_hardware_waits_for_a_slow_disk(tmp_path: Path) -> None:
+    """An action without a device starts when its order survives this process."""
+    syncs: list[Callable[[], None]] = []
+    store = JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0)
+    bench = Bench(store=store, device='node = "motion"')
+    bench.executor.in_background = syncs.append
+    bench.link(0.0)
+    bench.executor.stimulate(0.0, Begin())
+    assert bench.calls() == [WORK] and not syncs
+    bench.say(0.1, m.Accept(WORK))
+    bench.go(0.6)
+    assert len(syncs) == 1, "what has waited for half a second is synced"
+    bench.say(0.7, done(WORK))
+    assert bench.calls() == [TIDY], "also meanwhile"
 
 
 # --- arguments that no message carries --------------------------------------------------------

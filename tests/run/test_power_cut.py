@@ -70,15 +70,22 @@ def watched(caller: Caller, name: str, look: Callable[..., None]) -> None:
     setattr(caller, name, call)
 
 
+@pytest.mark.parametrize(
+    ("disk_waits", "bell"), [(None, 10), (0, 10), (2, 10), (9, 10), (2, 0), (9, 0), (9, 5)]
+)
 def test_calls_and_acknowledgements_are_sent_only_after_their_records_are_on_disk(
-    tmp_path: Path,
+    tmp_path: Path, disk_waits: int | None, bell: int
 ) -> None:
     """With the real store: for each call, cancel and acknowledgement, when it is passed to the
-    connection."""
+    connection. `disk_waits`: how many tenths of a second a sync in the background takes;
+    None: syncs are done at once."""
     seen: list[str] = []
+    syncs: list[Callable[[], None]] = []
     with power_cut(tmp_path) as disk:
         store = JournalStore(JournalWriter(tmp_path / JOURNAL, {"mission": "m"}), 0.0)
         bench = Bench(store=store)
+        if disk_waits is not None:
+            bench.executor.in_background = syncs.append
         places = directory()
         engine = Engine(
             loads(TASK, "toy"), {a.name: a.device for a in places.actions.values() if a.device}
@@ -113,17 +120,30 @@ def test_calls_and_acknowledgements_are_sent_only_after_their_records_are_on_dis
         for name, look in (("call", called), ("cancel", cancelled), ("acknowledge", acknowledged)):
             watched(bench.caller, name, look)
         watched(bench.caller, "acknowledge_event", event)
+        answers: dict[str, list[m.Message]] = {
+            WORK: [m.Accept(WORK)],
+            TIDY: [m.Accept(TIDY), m.Outcome(TIDY, "success")],
+        }
+        began = 0
         bench.link(0.0)
         bench.executor.stimulate(0.0, Begin())
-        bench.say(0.0, m.Accept(WORK))
-        bench.ring(1.0)
-        bench.go(1.0 + 0.6)
-        bench.say(2.0, m.Outcome(WORK, "error", {}, "cancelled"))
-        bench.say(2.1, m.Accept(TIDY))
-        bench.say(2.2, m.Outcome(TIDY, "success"))
-        bench.go(3.0)
+        for tick in range(100):
+            if tick == bell:
+                bench.ring(tick / 10)
+            for message in bench.sent(m.Call, m.Cancel):
+                if isinstance(message, m.Call):
+                    bench.say(tick / 10, *answers[message.id])
+                else:
+                    bench.say(tick / 10, m.Outcome(WORK, "error", {}, "cancelled"))
+            assert len(syncs) <= 1
+            if not syncs:
+                began = tick
+            elif tick >= began + (disk_waits or 0):
+                syncs.pop()()
+                bench.executor.synced(tick / 10)
+            bench.go(tick / 10)
         store.writer.close()
-    assert bench.executor.finished is not None
+    assert bench.executor.over
     expected = [
         f"call {WORK}",
         f"cancel {WORK}",
@@ -146,9 +166,28 @@ class Cellar(Laboratory):
         for caller in mission.callers.values():
             watched(caller, "acknowledge", self.acknowledged.add)
 
+    def slow_disk(self, mission: Mission, ticks: int) -> None:
+        """Let a sync take so many ticks, while the coordinator goes on."""
+        syncs: list[Callable[[], None]] = []
+        mission.executor.in_background = syncs.append
+        waited = 0
 
-def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: Any) -> None:
-    """Cut the power at an operation of the journal, and resume from what is left."""
+        def disk(now: float) -> None:
+            nonlocal waited
+            waited = waited + 1 if syncs else 0
+            if waited > ticks:
+                waited = 0
+                syncs.pop()()
+                mission.synced(now)
+
+        self.disk = disk
+
+
+def cut_and_resume(
+    task: Task, folder: Path, lives: int, torn: float, expected: Any, ticks: int = 0
+) -> None:
+    """Cut the power at an operation of the journal, and resume from what is left. `ticks`: how long
+    a sync in the background takes; 0: it is done at once."""
     folder.mkdir()
     laboratory = Cellar(task, folder / "run")
 
@@ -156,6 +195,8 @@ def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: 
         mission = make_mission(*given)
         laboratory.watch(mission)
         mission.executor.store.__dict__["durable"] = True  # the actions of this cell have no device
+        if ticks:
+            laboratory.slow_disk(mission, ticks)
         return mission
 
     with power_cut(folder) as disk, pytest.MonkeyPatch.context() as patch:
@@ -163,7 +204,8 @@ def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: 
         with pytest.raises(CrashError):
             laboratory.begin(lives)
         image = disk.left(torn)
-    where = f"power cut at operation {lives}, {torn:g} of what was not synced"
+    laboratory.disk = lambda now: None
+    where = f"power cut at operation {lives}, {torn:g} of what was not synced, {ticks} ticks"
     journal = folder / JOURNAL
     assert JOURNAL in image, f"{where}: the journal is gone"
     journal.write_bytes(image[JOURNAL])
@@ -179,14 +221,16 @@ def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: 
     )
 
 
-def places(task: Task, folder: Path) -> tuple[Any, int]:
+def places(task: Task, folder: Path, ticks: int = 0) -> tuple[Any, int]:
     """Return the outcome without a power cut, and the number of operations at which one can
     happen."""
-    laboratory = Laboratory(task, folder / "undisturbed")
+    laboratory = Cellar(task, folder / f"undisturbed {ticks}")
 
     def durable(*given: Any) -> Mission:
         mission = make_mission(*given)
         mission.executor.store.__dict__["durable"] = True
+        if ticks:
+            laboratory.slow_disk(mission, ticks)
         return mission
 
     with pytest.MonkeyPatch.context() as patch:
@@ -204,6 +248,20 @@ def test_a_power_cut_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) 
     drawn = np.random.default_rng(2).choice(np.arange(1, operations), 20, replace=False)
     for number, lives in enumerate(sorted(drawn)):
         cut_and_resume(catch_ball, tmp_path / str(lives), int(lives), TORN[number % 3], expected)
+
+
+def test_a_power_cut_while_a_slow_disk_syncs_changes_nothing(
+    catch_ball: Task, tmp_path: Path
+) -> None:
+    """The coordinator goes on meanwhile: what it does must wait for the right sync."""
+    expected, _ = places(catch_ball, tmp_path)
+    for ticks in (1, 7, 40):
+        slow, operations = places(catch_ball, tmp_path, ticks)
+        assert slow == expected
+        drawn = np.random.default_rng(ticks).choice(np.arange(1, operations), 8, replace=False)
+        for number, lives in enumerate(sorted(drawn)):
+            folder = tmp_path / f"{ticks} {lives}"
+            cut_and_resume(catch_ball, folder, int(lives), TORN[number % 3], expected, ticks)
 
 
 @pytest.mark.proof

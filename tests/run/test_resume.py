@@ -84,10 +84,15 @@ class MortalStore(JournalStore):
         super().flush()
         self._count()
 
-    def sync(self) -> None:
+    def begin_sync(self) -> Callable[[], None]:
         self._count()
-        super().sync()
-        self._count()
+        work = super().begin_sync()
+
+        def sync() -> None:
+            work()
+            self._count()
+
+        return sync
 
 
 class Laboratory:
@@ -101,6 +106,8 @@ class Laboratory:
         counted = {name: self._counting(action) for name, action in scripts(task, LINES).items()}
         self.node = lockstep_party(self.directory, self.directory.nodes["node"], counted)
         self.cell: LockStepCell | None = None
+        self.disk: Callable[[float], None] = lambda now: None
+        """Called at each tick."""
 
     def _counting(self, action: Callable[..., Any]) -> Callable[..., Any]:
         def counting(ctx: Any, **arguments: Any) -> Any:
@@ -143,7 +150,13 @@ class Laboratory:
             self.cell = LockStepCell([party, self.node])
         else:
             self.cell.replace(party)
-        assert self.cell.run(lambda: party.over, 100_000)
+        cell = self.cell
+
+        def over() -> bool:
+            self.disk(cell.now)
+            return party.over
+
+        assert cell.run(over, 100_000)
 
 
 def outcome(mission: Mission) -> Mapping[str, Any]:

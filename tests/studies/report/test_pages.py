@@ -428,7 +428,7 @@ def test_report_of_a_recorded_run(
     assert LockStepCell(
         [party, *(lockstep_party(directory, node) for node in directory.nodes.values())]
     ).run(lambda: party.over, 100_000)
-    store.sync()
+    store.writer.sync()
     assert main(["report", str(folder)]) == 0
     page = (folder / "report.html").read_text(encoding="utf-8")
     failed = [
