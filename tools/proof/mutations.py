@@ -64,8 +64,8 @@ MUTATIONS = (
     _m(
         "results are acknowledged before the journal is synced",
         RUN + "executor.py",
-        "            self.store.flush()\n",
-        "            self.store.flush()\n            self._acknowledge()\n",
+        "        if not self.store.safe:\n            sync",
+        "        while then:\n            then.pop()(now)\n        if not self.store.safe:\n            sync",
         "tests/run",
     ),
     _m(
@@ -138,6 +138,20 @@ MUTATIONS = (
         RUN + "executor.py",
         "waited = self._unsafe_since is not None and now >= self._unsafe_since + SYNC_WITHIN",
         "waited = False",
+        "tests/run",
+    ),
+    _m(
+        "an order leaves after a sync that began before it",
+        RUN + "executor.py",
+        "        self._let_leave(now, effects)\n        self._work(now)\n",
+        "        self._let_leave(now, effects + self._effects)\n        self._work(now)\n",
+        "tests/run",
+    ),
+    _m(
+        "a stop overtakes the start of its run, which waits for the disk",
+        RUN + "executor.py",
+        "(effect.run in runs or self._needs_sync(effect))",
+        "self._needs_sync(effect)",
         "tests/run",
     ),
     _m(
