@@ -87,6 +87,8 @@ class Punctuality:
         )
 
 
+SLOW_DISK: Final = 0.3
+"""From this duration of a sync on the result says that the disk is slow (s)."""
 LINGER = 1.0
 """Longest wait for anything at the end of a run (s)."""
 ASK_AGAIN: Final = 0.2
@@ -146,6 +148,8 @@ class RealtimeMission:
         self._looking: asyncio.TimerHandle | None = None
         self._disk = ThreadPoolExecutor(1, "journal")
         self._syncing: asyncio.Future[None] | None = None
+        self._slowest_sync = 0.0
+        """Longest time that a sync took (s)."""
         mission.executor.in_background = self._sync
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
@@ -289,6 +293,11 @@ class RealtimeMission:
         await self._over.wait()
         if remark := self._punctuality.remark():
             self.mission.remarks["host"] = remark
+        if self._slowest_sync >= SLOW_DISK:
+            self.mission.remarks["disk"] = (
+                f"orders to devices waited up to {self._slowest_sync:.1f} s for the disk of the "
+                "journal; what failed may be due to that (--journal FOLDER: on a faster disk)"
+            )
         if self._fault is not None:
             raise self._fault
 
@@ -342,9 +351,10 @@ class RealtimeMission:
     def _sync(self, work: Callable[[], None]) -> None:
         """Make the journal durable in a thread."""
         self._syncing = self._loop.run_in_executor(self._disk, work)
-        self._syncing.add_done_callback(self._synced)
+        self._syncing.add_done_callback(partial(self._synced, self.now()))
 
-    def _synced(self, done: asyncio.Future[None]) -> None:
+    def _synced(self, began: float, done: asyncio.Future[None]) -> None:
+        self._slowest_sync = max(self._slowest_sync, self.now() - began)
         if (fault := done.exception()) is not None:
             self.fail(fault)
         elif not self._closed and self._fault is None:

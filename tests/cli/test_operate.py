@@ -158,6 +158,9 @@ async def test_a_slow_disk_delays_the_robot_and_not_the_coordinator(
     assert ((await raising).code, (await pausing).code) == (0, 0)
     assert (await petrobot("continue")).code == 0
     await until(lambda: petrobot.arm.moving)
+    await petrobot("abort")
+    await petrobot.running
+    assert "s for the disk of the journal; what failed" in petrobot.mission.remarks["disk"]
 
 
 async def test_a_command_is_answered_when_the_run_ends_before_its_disk_has_written(
