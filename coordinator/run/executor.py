@@ -171,9 +171,8 @@ class Executor:
     def advance(self, now: float) -> None:
         """Handle elapsed timers, start runs that waited for a fence, and sync records that have
         waited for long."""
-        if (
-            self.dispatch.idle and self._unsafe_since is None
-        ):  # asked at each tick of a lock-step cell
+        # Asked first, because a lock-step cell calls this at each tick.
+        if self.dispatch.idle and self._unsafe_since is None:
             return
         due = self.due()
         if due is None or now < due:
@@ -199,9 +198,9 @@ class Executor:
         """The sync that `in_background` was given has ended: let leave what waited for it."""
         assert self._syncing is not None
         (effects, then), self._syncing = self._syncing, None
+        self._let_leave(now, effects)
         for call in then:
             call(now)
-        self._let_leave(now, effects)
         self._work(now)
 
     @property
