@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_dry_run_argument,
+    add_json_argument,
+    add_mock_argument,
     add_services_argument,
     cell_path,
     load_directory,
@@ -142,14 +144,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="start the nodes of this host for this run, and stop them after it",
     )
     add_dry_run_argument(parser)
-    parser.add_argument(
-        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
-    )
+    add_mock_argument(parser)
     add_learning_arguments(parser)
     add_start_from_arguments(parser)
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the result")
     parser.add_argument(
         "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
     )
