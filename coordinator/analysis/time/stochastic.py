@@ -295,7 +295,7 @@ def stochastic_view(
     ValueError for what a GSPN cannot express.
     """
     known = measured or Measured()
-    return _Derivation(task.flat, known, stages, timer_stages, devices or {}).result()
+    return _Derivation(task.flat, known, stages, timer_stages, devices or {}).derive()
 
 
 class _Derivation:
@@ -376,30 +376,36 @@ class _Derivation:
             if p.kind is Kind.ACTION and self._may_hold(p.name, p.most_active + 1)
         )
         """Action places where a token may have to wait for a server."""
+        self.switched: set[str] = set()
+        """Transitions whose condition is open in some case."""
+        self.turns: Weights = {}
+        """By transition: of those that can fire at once, the highest fires first."""
+
+    def derive(self) -> StochasticView:
+        """Build everything, and return the view."""
         for device in sorted(self.contended):
             self.places[f"device {device}"] = 0
             self.assumptions.append(
                 f"{device}: if several runs wait for this device, each is as likely to be "
                 "the next (they are served in the order in which they came)"
             )
-        for place in task.places.values():
+        for place in self.task.places.values():
             if place.kind is Kind.ACTION:
                 self._action_place(place)
         self.switched = {
             t.name
-            for t in task.transitions.values()
+            for t in self.task.transitions.values()
             if not self.compiled[t.name].never and any(case.open_ for case in self._cases(t))
         }
-        """Transitions whose condition is open in some case."""
         self.turns = self._turns()
-        for event in task.events.values():
+        for event in self.task.events.values():
             if event.scope is Scope.EXTERNAL:
                 self._event(event)
-        for transition in task.transitions.values():
+        for transition in self.task.transitions.values():
             self._transition(transition)
+        return self._view()
 
-    def result(self) -> StochasticView:
-        """Return the finished view."""
+    def _view(self) -> StochasticView:
         capacity = {
             p: c
             for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
