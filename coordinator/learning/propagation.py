@@ -459,7 +459,6 @@ def propagate(
     task: Task,
     estimates: Estimates,
     context: str | None = None,
-    choice: ChoiceShares | None = None,
     *,
     questions: Mapping[str, Question] | None = None,
     rho: float | None = None,
@@ -479,7 +478,7 @@ def propagate(
             asked[name] = replace(asked[name], declared=tuple(primitive.costs.items()))
     scenarios = [context] if context is not None else _scenarios(task, estimates)
     where: Sequence[str | None] = scenarios or [None]
-    solved = [(_solve(task, measured_from(task, estimates, w, choice)), w) for w in where]
+    solved = [(_solve(task, measured_from(task, estimates, w)), w) for w in where]
     hardest = min(solved, key=lambda one: (one[0].solved.conjunctive_reliability, one[1] or ""))
     # The lowest of m: intervals at 1 - (1 - level) / m pay for the choice (Bonferroni).
     return _figures(task, estimates, *hardest, asked, context, rho, len(where))

@@ -245,7 +245,7 @@ def _resumed(found: Recorded, observers: Sequence[Observer], ordered: float) -> 
         found.directory, found.task, found.engine, found.journal, replayed, now, selector, see
     )
     if lockstep:
-        member, party = lockstep_member(found.directory, mission, None, begin)
+        member, party = lockstep_member(found.directory, mission, begin)
         return LockstepSession(party, selector, learning, folder, member=member, resumed=True)
     return RealtimeSession(
         found.directory,
