@@ -12,50 +12,29 @@ from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task.file import loads
+from tests.studies.forecast.task_text import task_text
 
 TASK = loads(
-    """
+    task_text("""
 schema = 1
 [task]
 name = "two"
 final = "jobs == 0 and free == 1"
 runs_place = "jobs"
-[primitive_tasks.a]
-goal = "a"
-alternatives = ["a_a"]
-deadline = 9.0
-[primitive_tasks.b]
-goal = "b"
-alternatives = ["b_a"]
-deadline = 9.0
 [places.jobs]
 kind = "control"
 tokens = 1
 [places.free]
 kind = "resource"
 tokens = 1
-[places.a]
-kind = "action"
-task = "a"
-[places.b]
-kind = "action"
-task = "b"
-[transitions.begin]
-in = ["jobs", "free"]
-out = ["a"]
-[transitions.on]
-in = ["a:normal"]
-out = ["b"]
-[transitions.off]
-in = ["a:error"]
-out = ["free"]
-[transitions.done]
-in = ["b:normal"]
-out = ["free"]
-[transitions.lost]
-in = ["b:error"]
-out = ["free"]
-""",
+a! a_a
+b! b_a
+begin: jobs, free -> a
+on: a:normal -> b
+off: a:error -> free
+done: b:normal -> free
+lost: b:error -> free
+"""),
     "two.toml",
 )
 HARD = {"A": 0.05, "B": 0.3}

@@ -34,7 +34,8 @@ from petrobot.coordinator.studies.forecast.registered import read, register, wri
 from petrobot.coordinator.studies.forecast.residual import durations, measured
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
-from tests.studies.forecast.conftest import Make, with_transitions
+from tests.studies.forecast.conftest import Make
+from tests.studies.forecast.task_text import task_text
 
 RUNS = 400
 
@@ -224,39 +225,21 @@ def test_the_weight_of_censored_runs_goes_to_later_ends(pair: Task) -> None:
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
 
 
-RACE = with_transitions("""
+RACE = task_text("""
 schema = 1
 [task]
 name = "race"
 final = "jobs == 0 and free == 1"
 runs_place = "jobs"
-[primitive_tasks.look]
-goal = "seen"
-alternatives = ["look"]
-deadline = 2.0
-[primitive_tasks.hold]
-goal = "held"
-alternatives = ["hold"]
-deadline = 9.0
-[primitive_tasks.move]
-goal = "moved"
-alternatives = ["move"]
-deadline = 9.0
 [places.jobs]
 kind = "control"
 tokens = 4
 [places.free]
 kind = "resource"
 tokens = 1
-[places.look]
-kind = "action"
-task = "look"
-[places.hold]
-kind = "action"
-task = "hold"
-[places.move]
-kind = "action"
-task = "move"
+look! look; deadline = 2.0
+hold! hold
+move! move
 begin: jobs, free -> look
 seen: look:normal -> hold, move
 not_seen: look:error -> free
@@ -326,40 +309,22 @@ def test_other_durations_and_shares_are_forecast_as_they_then_come(
         assert found["figures"][name]["value"] == pytest.approx(truth[name], rel=0.03)
 
 
-STEPS = with_transitions("""
+STEPS = task_text("""
 schema = 1
 [task]
 name = "steps"
 final = "jobs == 0 and free == 1"
 goal_transitions = ["done"]
 runs_place = "jobs"
-[primitive_tasks.look]
-goal = "seen"
-alternatives = ["look_0", "look_1", "look_2", "look_3", "look_4"]
-deadline = 9.0
-[primitive_tasks.plan]
-goal = "planned"
-alternatives = ["plan_0", "plan_1", "plan_2"]
-deadline = 9.0
-[primitive_tasks.grasp]
-goal = "held"
-alternatives = ["grasp_0", "grasp_1"]
-deadline = 9.0
 [places.jobs]
 kind = "control"
 tokens = 4
 [places.free]
 kind = "resource"
 tokens = 1
-[places.look]
-kind = "action"
-task = "look"
-[places.plan]
-kind = "action"
-task = "plan"
-[places.grasp]
-kind = "action"
-task = "grasp"
+look! look_0, look_1, look_2, look_3, look_4
+plan! plan_0, plan_1, plan_2
+grasp! grasp_0, grasp_1
 begin: jobs, free -> look
 seen: look:normal -> plan
 not_seen: look:error -> free

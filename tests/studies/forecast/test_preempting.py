@@ -32,22 +32,15 @@ from petrobot.coordinator.studies.forecast.residual import measured
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.conftest import with_transitions
+from tests.studies.forecast.task_text import task_text
 
-HEAD = with_transitions("""
+HEAD = task_text("""
 schema = 1
 [task]
 name = "scan"
 goal_transitions = ["found"]
 runs_place = "parts"
 final = "parts == 0 and idle == 1"
-[primitive_tasks.locate]
-goal = "located"
-alternatives = ["locate_a"]
-deadline = 9.0
-[primitive_tasks.watch]
-goal = "watched"
-alternatives = ["watch_a"]
-deadline = 9.0
 [events.bell]
 scope = "external"
 memory = "pulse"
@@ -60,12 +53,8 @@ tokens = 4
 [places.idle]
 kind = "resource"
 tokens = 1
-[places.locate]
-kind = "action"
-task = "locate"
-[places.watch]
-kind = "action"
-task = "watch"
+locate! locate_a
+watch! watch_a
 next: parts, idle -> watch, locate
 """)
 ALONE = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
