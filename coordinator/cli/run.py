@@ -90,6 +90,24 @@ REFUSED = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    _add_task_arguments(parser)
+    _add_cell_arguments(parser)
+    add_learning_arguments(parser)
+    add_start_from_arguments(parser)
+    add_output_arguments(parser)
+    add_journal_arguments(parser)
+    add_page_arguments(parser)
+    add_log_level_argument(parser)
+    parser.add_argument(
+        "--quiet",
+        action="store_true",
+        help="no progress, and no search of the net for faults",
+    )
+    add_services_argument(parser)
+    parser.set_defaults(folder=None)
+
+
+def _add_task_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task",
         nargs="?",
@@ -126,6 +144,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TASK=ACTION",
         help="always use this action for this primitive task",
     )
+
+
+def _add_cell_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--processes",
         type=int,
@@ -145,22 +166,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_dry_run_argument(parser)
     add_mock_argument(parser)
-    add_learning_arguments(parser)
-    add_start_from_arguments(parser)
+
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add `--json` and `--report`."""
     add_json_argument(parser, "the result")
     parser.add_argument(
         "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
     )
-    add_journal_arguments(parser)
-    add_page_arguments(parser)
-    add_log_level_argument(parser)
-    parser.add_argument(
-        "--quiet",
-        action="store_true",
-        help="no progress, and no search of the net for faults",
-    )
-    add_services_argument(parser)
-    parser.set_defaults(folder=None)
 
 
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
