@@ -12,29 +12,29 @@ from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task.file import loads
-from tests.studies.forecast.task_text import task_text
 
 TASK = loads(
-    task_text("""
+    """
 schema = 1
 [task]
 name = "two"
 final = "jobs == 0 and free == 1"
 runs_place = "jobs"
-[places.jobs]
-kind = "control"
-tokens = 1
-[places.free]
-kind = "resource"
-tokens = 1
-a! a_a
-b! b_a
-begin: jobs, free -> a
-on: a:normal -> b
-off: a:error -> free
-done: b:normal -> free
-lost: b:error -> free
-"""),
+[primitive_tasks]
+a = { goal = "a", alternatives = ["a_a"], deadline = 9.0 }
+b = { goal = "b", alternatives = ["b_a"], deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 1 }
+free = { kind = "resource", tokens = 1 }
+a = { kind = "action" }
+b = { kind = "action" }
+[transitions]
+begin = { in = ["jobs", "free"], out = ["a"] }
+on = { in = ["a:normal"], out = ["b"] }
+off = { in = ["a:error"], out = ["free"] }
+done = { in = ["b:normal"], out = ["free"] }
+lost = { in = ["b:error"], out = ["free"] }
+""",
     "two.toml",
 )
 HARD = {"A": 0.05, "B": 0.3}

@@ -34,8 +34,7 @@ from petrobot.coordinator.studies.forecast.registered import read, register, wri
 from petrobot.coordinator.studies.forecast.residual import durations, measured
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
-from tests.studies.forecast.conftest import Make
-from tests.studies.forecast.task_text import task_text
+from tests.studies.forecast.conftest import Make, with_transitions
 
 RUNS = 400
 
@@ -225,21 +224,22 @@ def test_the_weight_of_censored_runs_goes_to_later_ends(pair: Task) -> None:
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
 
 
-RACE = task_text("""
+RACE = with_transitions("""
 schema = 1
 [task]
 name = "race"
 final = "jobs == 0 and free == 1"
 runs_place = "jobs"
-[places.jobs]
-kind = "control"
-tokens = 4
-[places.free]
-kind = "resource"
-tokens = 1
-look! look; deadline = 2.0
-hold! hold
-move! move
+[primitive_tasks]
+look = { goal = "seen", alternatives = ["look"], deadline = 2.0 }
+hold = { goal = "held", alternatives = ["hold"], deadline = 9.0 }
+move = { goal = "moved", alternatives = ["move"], deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 4 }
+free = { kind = "resource", tokens = 1 }
+look = { kind = "action" }
+hold = { kind = "action" }
+move = { kind = "action" }
 begin: jobs, free -> look
 seen: look:normal -> hold, move
 not_seen: look:error -> free
@@ -309,22 +309,25 @@ def test_other_durations_and_shares_are_forecast_as_they_then_come(
         assert found["figures"][name]["value"] == pytest.approx(truth[name], rel=0.03)
 
 
-STEPS = task_text("""
+STEPS = with_transitions("""
 schema = 1
 [task]
 name = "steps"
 final = "jobs == 0 and free == 1"
 goal_transitions = ["done"]
 runs_place = "jobs"
-[places.jobs]
-kind = "control"
-tokens = 4
-[places.free]
-kind = "resource"
-tokens = 1
-look! look_0, look_1, look_2, look_3, look_4
-plan! plan_0, plan_1, plan_2
-grasp! grasp_0, grasp_1
+[primitive_tasks]
+look.goal = "seen"
+look.alternatives = ["look_0", "look_1", "look_2", "look_3", "look_4"]
+look.deadline = 9.0
+plan = { goal = "planned", alternatives = ["plan_0", "plan_1", "plan_2"], deadline = 9.0 }
+grasp = { goal = "held", alternatives = ["grasp_0", "grasp_1"], deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 4 }
+free = { kind = "resource", tokens = 1 }
+look = { kind = "action" }
+plan = { kind = "action" }
+grasp = { kind = "action" }
 begin: jobs, free -> look
 seen: look:normal -> plan
 not_seen: look:error -> free

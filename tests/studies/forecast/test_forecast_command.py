@@ -318,19 +318,11 @@ goal_transitions = ["done"]
 runs_place = "jobs"
 [primitive_tasks.move]
 deadline = 9.0
-[places.jobs]
-kind = "control"
-tokens = 4
-[places.free]
-kind = "resource"
-tokens = 1
-[places.fetch]
-kind = "action"
-task = "move"
-timeout = 3.0
-[places.bring]
-kind = "action"
-task = "move"
+[places]
+jobs = { kind = "control", tokens = 4 }
+free = { kind = "resource", tokens = 1 }
+fetch = { kind = "action", task = "move", timeout = 3.0 }
+bring = { kind = "action", task = "move" }
 begin: jobs, free -> fetch
 on: fetch:normal -> bring
 late: fetch:error -> free

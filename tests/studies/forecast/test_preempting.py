@@ -32,29 +32,28 @@ from petrobot.coordinator.studies.forecast.residual import measured
 from petrobot.coordinator.task import Status, Task
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.conftest import with_transitions
-from tests.studies.forecast.task_text import task_text
 
-HEAD = task_text("""
+HEAD = with_transitions("""
 schema = 1
 [task]
 name = "scan"
 goal_transitions = ["found"]
 runs_place = "parts"
 final = "parts == 0 and idle == 1"
+[primitive_tasks]
+locate = { goal = "located", alternatives = ["locate_a"], deadline = 9.0 }
+watch = { goal = "watched", alternatives = ["watch_a"], deadline = 9.0 }
 [events.bell]
 scope = "external"
 memory = "pulse"
 mean_wait = 1.0
 [variables.dark]
 type = "bool"
-[places.parts]
-kind = "control"
-tokens = 4
-[places.idle]
-kind = "resource"
-tokens = 1
-locate! locate_a
-watch! watch_a
+[places]
+parts = { kind = "control", tokens = 4 }
+idle = { kind = "resource", tokens = 1 }
+locate = { kind = "action" }
+watch = { kind = "action" }
 next: parts, idle -> watch, locate
 """)
 ALONE = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
