@@ -441,16 +441,11 @@ def test_a_run_beyond_the_longest_one_ends_at_the_latest_at_its_deadline() -> No
 
 def test_without_measurements_declared_durations_race(tmp_path: object) -> None:
     """Before any run, the declared estimates are used: a preempting end needs no declared wait."""
-    declared = ONE_WAY.replace(
-        "[primitive_tasks.watch]",
-        "[primitive_tasks.locate.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
-        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 "
-        "}\n[primitive_tasks.watch]",
-    ).replace(
-        "[events.bell]",
-        "[primitive_tasks.watch.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
-        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 }\n[events.bell]",
+    guess = (
+        "deadline = 9.0, estimates = { success = { share = 1.0, mean = 1.0, cv = 1.0 }, "
+        "failure = { share = 0.0, mean = 0.0 }, error = { share = 0.0, mean = 0.0 } }"
     )
+    declared = ONE_WAY.replace("deadline = 9.0", guess)
     from petrobot.coordinator.analysis.time.task_forecast import forecast
 
     found = forecast(stochastic_view(loads(declared, "scan.toml")))
