@@ -28,11 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", help="a net or task file, or the name of a task that comes with petrobot"
     )
-    parser.add_argument(
-        "target",
-        type=Path,
-        help=f"the file to write: {', '.join(endings)}",
-    )
+    parser.add_argument("target", type=Path, help=f"the file to write: {', '.join(endings)}")
     parser.add_argument(
         "--view",
         choices=("ordinary", "gspn"),

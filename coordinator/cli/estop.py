@@ -44,9 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also stop the devices on this host's buses, without waiting for their node",
     )
     parser.add_argument(
-        "--run",
-        metavar="RUN",
-        help="stop the cell of this run (default: the newest active run)",
+        "--run", metavar="RUN", help="stop the cell of this run (default: the newest active run)"
     )
     add_runs_argument(parser)
     add_json_argument(parser, "the answers")

@@ -24,12 +24,7 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
-from petrobot.services.comm.location_file import (
-    FIRST_PHYSICS,
-    MOCK,
-    physics_of,
-    same_physics,
-)
+from petrobot.services.comm.location_file import FIRST_PHYSICS, MOCK, physics_of, same_physics
 from petrobot.services.host.command_line import MOST_RUNS, whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 

@@ -40,13 +40,7 @@ from petrobot.coordinator.cli.options import (
     tidy,
 )
 from petrobot.coordinator.operator.task_check import cell_of
-from petrobot.services.host.command_line import (
-    LARGEST_SEED,
-    MOST_RUNS,
-    number,
-    probability,
-    whole,
-)
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
@@ -99,9 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_page_arguments(parser)
     add_log_level_argument(parser)
     parser.add_argument(
-        "--quiet",
-        action="store_true",
-        help="no progress, and no search of the net for faults",
+        "--quiet", action="store_true", help="no progress, and no search of the net for faults"
     )
     add_services_argument(parser)
     parser.set_defaults(folder=None)
@@ -280,8 +272,7 @@ def run(options: argparse.Namespace) -> int:
     directory = load_directory(cell_path(options.services, options.task, task), options.dry_run)
     if options.join and (not lockstep or options.processes != 0):
         raise CommandError(
-            2,
-            "--join needs --mode lockstep --processes 0; in real time, nodes are always joined",
+            2, "--join needs --mode lockstep --processes 0; in real time, nodes are always joined"
         )
     _refuse_unfit(task, directory)
     if (lockstep or options.up) and not options.join:
@@ -307,9 +298,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def conduct(
-    make: Callable[[Sequence[Observer]], RunSession],
-    options: argparse.Namespace,
-    mode: str,
+    make: Callable[[Sequence[Observer]], RunSession], options: argparse.Namespace, mode: str
 ) -> int:
     """Make a session, lead it to its end, print and write its result. Return the exit code."""
     from petrobot.coordinator.cli.output import give
@@ -479,12 +468,7 @@ def refuse_stopped(directory: Directory) -> None:
 
 
 def _request(task: Task, directory: Directory, options: argparse.Namespace) -> RunRequest:
-    from petrobot.coordinator.operator.prepare import (
-        JOINED,
-        LAUNCHED,
-        ONE_PROCESS,
-        RunRequest,
-    )
+    from petrobot.coordinator.operator.prepare import JOINED, LAUNCHED, ONE_PROCESS, RunRequest
 
     chosen = pairs("--use", options.use, "TASK=ACTION")
     for primitive, action in chosen.items():

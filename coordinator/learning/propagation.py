@@ -30,12 +30,7 @@ from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.objective import (
-    Comparison,
-    Question,
-    compare,
-    objective,
-)
+from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
 from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
 
@@ -668,11 +663,7 @@ def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Esti
 
 
 def _part(
-    name: str,
-    judged: Comparison,
-    shares: Mapping[str, float],
-    question: Question,
-    runs: float,
+    name: str, judged: Comparison, shares: Mapping[str, float], question: Question, runs: float
 ) -> tuple[PrimitiveFigures, dict[str, Uncertain]] | None:
     """Return the figures of a primitive task and the cost of each alternative; None if no
     alternative that is chosen was measured."""

@@ -31,15 +31,7 @@ from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
-from petrobot.coordinator.task import (
-    EarlyEvent,
-    End,
-    EventMemory,
-    Kind,
-    Status,
-    Task,
-    Transition,
-)
+from petrobot.coordinator.task import EarlyEvent, End, EventMemory, Kind, Status, Task, Transition
 from petrobot.coordinator.task.conditions import Domain, Expression, equivalent
 from petrobot.coordinator.task.validation import condition_domains, marking_domains
 
@@ -247,10 +239,7 @@ class Training:
         waits: dict[str, list[tuple[Waited, int]]] = {}
         timers = _cutting_timers(task)
         for i, trial in enumerate(kept):
-            for wait in (
-                *trial.waits,
-                *(Waited(t, s) for t in timers for s in _waited(t, trial)),
-            ):
+            for wait in (*trial.waits, *(Waited(t, s) for t in timers for s in _waited(t, trial))):
                 waits.setdefault(wait.transition, []).append((wait, i))
         found = {name: _waits(task, name, known) for name, known in waits.items()}
         return cls(
@@ -298,10 +287,7 @@ def _sets_flag(remembered: tuple[EventMemory, EarlyEvent] | None, wait: Waited) 
 
 
 def by_regime(
-    task: Task,
-    rows: Iterable[TrialRow],
-    cell: Cell | None = None,
-    same: bool = True,
+    task: Task, rows: Iterable[TrialRow], cell: Cell | None = None, same: bool = True
 ) -> dict[str, Training]:
     """Return the training of each regime of a table. `cell`: where the task will run; `same`:
     whether the trials are of the task as it is."""

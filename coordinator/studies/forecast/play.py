@@ -29,15 +29,7 @@ from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
-from petrobot.coordinator.task import (
-    Counts,
-    EarlyEvent,
-    End,
-    EventMemory,
-    Start,
-    Status,
-    Task,
-)
+from petrobot.coordinator.task import Counts, EarlyEvent, End, EventMemory, Start, Status, Task
 from petrobot.coordinator.task.compiled_task import ActionArc
 from petrobot.coordinator.task.conditions import ConditionFault, Expression
 from petrobot.coordinator.task.conditions.language import Scalar

@@ -16,12 +16,7 @@ from petrobot.coordinator.learning.propagation import limits_of
 from petrobot.coordinator.learning.records import WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.direct import FEWEST, holm, missions
-from petrobot.coordinator.studies.forecast.history import (
-    Codes,
-    Training,
-    Values,
-    reads_variables,
-)
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values, reads_variables
 from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.task import EarlyEvent, EventMemory, Transition
