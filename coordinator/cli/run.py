@@ -331,7 +331,7 @@ def conduct(
     except KeyboardInterrupt:
         folder = made[0].folder if made and made[0].mission.executor.finished is None else None
         if folder is not None and folder.exists():  # one that had not begun leaves none
-            up = " --up" * getattr(options, "up", False)
+            up = " --up" * options.up
             print(f"`petrobot resume {folder}{up}` continues this run", file=sys.stderr)
         raise
     except MissionError as fault:
@@ -376,8 +376,7 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
         importlib.import_module(module)
     directory = session.mission.executor.directory
     try:
-        up = getattr(options, "up", False)
-        async with local_nodes(directory, mock=options.mock) if up else nullcontext():
+        async with local_nodes(directory, mock=options.mock) if options.up else nullcontext():
             await session.connect()
             async with _page(session, options):
                 with progress(options) as watch:
