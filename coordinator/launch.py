@@ -213,7 +213,6 @@ def lockstep_cell(
 def lockstep_member(
     directory: Directory,
     mission: Mission,
-    watch: Callable[[Mission, float], None] | None = None,
     begin: Callable[[float], None] | None = None,
 ) -> tuple[Member, CoordinatorParty]:
     """The coordinator's process of a cell in which each node has a process of its own.
@@ -221,18 +220,15 @@ def lockstep_member(
     With `begin` it joins an active cell in place of a coordinator that died; `begin` is called
     first.
     """
-    watching = None if watch is None else lambda now: watch(mission, now)
-    coordinator = CoordinatorParty(directory, mission, watching, begin)
-    delays, key = Delays(directory.delays()), cell_key(directory)
-    addresses, rejoins = directory.members(), begin is not None
+    coordinator = CoordinatorParty(directory, mission, begin)
     member = Member(
         NAME,
         [coordinator],
-        addresses,
-        delays=delays,
+        directory.members(),
+        delays=Delays(directory.delays()),
         directory=directory.hash,
-        key=key,
-        rejoins=rejoins,
+        key=cell_key(directory),
+        rejoins=begin is not None,
     )
     return member, coordinator
 

@@ -40,12 +40,7 @@ from petrobot.coordinator.analysis.time.simulate import (
     simulate,
 )
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import (
-    MATTERS,
-    TIME,
-    rough_fits,
-    timer_shares,
-)
+from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME, rough_fits, timer_shares
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
     change_gspn,
@@ -372,10 +367,7 @@ def _subject(
         return model.net, model.name, model.notes
     if model.gspn is None:
         raise NetFileError(
-            model.name or "net",
-            "rates",
-            "the file has none",
-            "give --rates FILE, or --rates unit",
+            model.name or "net", "rates", "the file has none", "give --rates FILE, or --rates unit"
         )
     return model.gspn, model.name, model.notes
 
@@ -692,10 +684,7 @@ def graph_command(path: Path) -> CommandResult:
 
 
 def gspn_of(
-    path: Path,
-    *,
-    measure: Measure | None,
-    cell_of: CellOf | None,
+    path: Path, *, measure: Measure | None, cell_of: CellOf | None
 ) -> tuple[StochasticView | NetFile, str]:
     """Return the stochastic view of a task, or a net file with rates, and which cell is assumed
     (empty for a net file).

@@ -30,12 +30,7 @@ from petrobot.coordinator.analysis.net.deadlocks import (
 from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net, judged, proven
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.space import (
-    INTERRUPTED,
-    SearchLimits,
-    Space,
-    explore,
-)
+from petrobot.coordinator.analysis.net.space import INTERRUPTED, SearchLimits, Space, explore
 from petrobot.coordinator.analysis.net.structure import (
     Lyapunov,
     Semiflows,
@@ -408,7 +403,7 @@ class Analysis:
             f"{size['arcs']} arcs; "
             f"{len(q.space)} markings, {q.space.edges} edges"
             + (" with the ends of runs" if self.ends is not None else "")
-            + ("" if q.space.complete else f" (partial: {q.space.reason})"),
+            + ("" if q.space.complete else f" (partial: {q.space.reason})")
         ]
         lines += [f"executed: {self.progress.size_text()}", ""] if self.progress else [""]
         told = list[Witness]()

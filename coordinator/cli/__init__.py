@@ -223,7 +223,7 @@ def _overview(arguments: Sequence[str]) -> int:
     return 2
 
 
-class _Parser(argparse.ArgumentParser):
+class _OptionParser(argparse.ArgumentParser):
     """Tells a wrong option in one line: the usage of a command has up to 20."""
 
     def error(self, message: str) -> NoReturn:
@@ -236,7 +236,7 @@ def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> 
     if shared:
         found = getattr(found, shared)()
     codes = SHORT_EXIT_CODES if command.name in PLAIN else EXIT_CODES
-    parser = _Parser(
+    parser = _OptionParser(
         prog=f"petrobot {command.name}",
         description=found.__doc__,
         epilog=f"example:\n  {found.EXAMPLE}\n\n{codes}",

@@ -16,6 +16,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     SLOW,
     add_estimates_argument,
+    add_json_argument,
     add_services_argument,
     cell_finder,
     measurements,
@@ -104,9 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         help="draw each refused verdict with the firings that lead there",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the answer")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -14,7 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    add_json_argument,
+    add_mock_argument,
+    add_seed_argument,
     add_services_argument,
+    add_task_argument,
     cell_path,
     load_directory,
     load_task,
@@ -27,7 +31,7 @@ from petrobot.coordinator.cli.loading import (
 from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.services.comm.location_file import physics_of
-from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
+from petrobot.services.host.command_line import MOST_RUNS, number, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.conduct import Campaign
@@ -54,9 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_trials(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
-    )
+    add_task_argument(parser, optional=True)
     parser.add_argument(
         "--runs",
         type=whole(most=MOST_RUNS),
@@ -120,13 +122,7 @@ def _add_execution(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="workers of this dask scheduler instead, as tcp://host:8786",
     )
-    parser.add_argument(
-        "--seed",
-        type=whole(0, LARGEST_SEED),
-        default=1,
-        metavar="S",
-        help="seed of all random numbers (%(default)s)",
-    )
+    add_seed_argument(parser)
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
     )
@@ -142,9 +138,7 @@ def _add_execution(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"runs between two updates of what is learned ({BATCH})",
     )
-    parser.add_argument(
-        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
-    )
+    add_mock_argument(parser)
     parser.add_argument(
         "--out",
         metavar="FOLDER",
@@ -166,9 +160,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="compare the result with a registered forecast",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the result")
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
 
 

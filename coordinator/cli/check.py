@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     MISSING_CELL,
+    add_json_argument,
     add_services_argument,
+    add_task_argument,
     cell_path,
     find_cell,
     load_directory,
@@ -55,16 +57,14 @@ UNLESS = "only if repaired"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
+    add_task_argument(parser)
     add_services_argument(parser)
     parser.add_argument(
         "--live",
         action="store_true",
         help="ask the nodes too: is each one up, does it offer what it should",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the findings as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the findings")
 
 
 def run(options: argparse.Namespace) -> int:

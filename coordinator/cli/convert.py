@@ -8,6 +8,7 @@ from pathlib import Path
 
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
+    add_json_argument,
     add_services_argument,
     cell_finder,
     measurements,
@@ -27,11 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", help="a net or task file, or the name of a task that comes with petrobot"
     )
-    parser.add_argument(
-        "target",
-        type=Path,
-        help=f"the file to write: {', '.join(endings)}",
-    )
+    parser.add_argument("target", type=Path, help=f"the file to write: {', '.join(endings)}")
     parser.add_argument(
         "--view",
         choices=("ordinary", "gspn"),
@@ -46,9 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_estimates_argument(parser)
     add_services_argument(parser)
-    parser.add_argument(
-        "--json", metavar="FILE", help="write what was not kept as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "what was not kept")
 
 
 def run(options: argparse.Namespace) -> int:

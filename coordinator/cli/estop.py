@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    add_json_argument,
     add_services_argument,
     load_directory,
     tell_of_demo,
@@ -43,14 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also stop the devices on this host's buses, without waiting for their node",
     )
     parser.add_argument(
-        "--run",
-        metavar="RUN",
-        help="stop the cell of this run (default: the newest active run)",
+        "--run", metavar="RUN", help="stop the cell of this run (default: the newest active run)"
     )
     add_runs_argument(parser)
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the answers as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the answers")
     add_services_argument(parser)
 
 

@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    add_json_argument,
+    add_seed_argument,
     add_services_argument,
+    add_task_argument,
     cell_finder,
     load_directory,
     load_task,
@@ -21,13 +24,8 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.coordinator.cli.options import pairs, refuse_idle
-from petrobot.services.comm.location_file import (
-    FIRST_PHYSICS,
-    MOCK,
-    physics_of,
-    same_physics,
-)
-from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, whole
+from petrobot.services.comm.location_file import FIRST_PHYSICS, MOCK, physics_of, same_physics
+from petrobot.services.host.command_line import MOST_RUNS, whole
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
@@ -46,9 +44,13 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument(
-        "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
-    )
+    _add_training(parser)
+    _add_further_runs(parser)
+    _add_output(parser)
+
+
+def _add_training(parser: argparse.ArgumentParser) -> None:
+    add_task_argument(parser, optional=True)
     parser.add_argument(
         "--estimates",
         metavar="FILE|CAMPAIGN",
@@ -61,6 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="which runs of an estimates file with several plants: real, simulated or mock",
     )
     add_services_argument(parser)
+
+
+def _add_further_runs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runs",
         type=whole(most=MOST_RUNS),
@@ -101,13 +106,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="B",
         help="number of bootstrap samples, at least 20 (%(default)s)",
     )
-    parser.add_argument(
-        "--seed",
-        type=whole(0, LARGEST_SEED),
-        default=1,
-        metavar="S",
-        help="seed of the simulation (%(default)s)",
-    )
+    add_seed_argument(parser)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FILE",
@@ -127,9 +129,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="compare with what was measured",
     )
     parser.add_argument("--markdown", metavar="FILE", type=Path, help="write the table as Markdown")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write everything as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "everything")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -18,7 +18,12 @@ from petrobot.coordinator.cli.learned_show import (
     show,
     task_line,
 )
-from petrobot.coordinator.cli.loading import estimates_path, load_task, write_json
+from petrobot.coordinator.cli.loading import (
+    add_json_argument,
+    estimates_path,
+    load_task,
+    write_json,
+)
 from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.command_line import number, probability
 
@@ -247,9 +252,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="reset: forget selectors' states, keep the estimates",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write what is shown as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "what is shown")
 
 
 def run(options: argparse.Namespace) -> int:

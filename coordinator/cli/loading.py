@@ -1,4 +1,5 @@
-"""How commands find their files: the task, services.toml, and where results go."""
+"""How commands find their files: the task, services.toml, and where results go; the options for
+them."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.operator.task_check import cell_of
+from petrobot.services.host.command_line import LARGEST_SEED, whole
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -37,6 +39,15 @@ SLOW = 2.0
 """Seconds after which a command says what it is doing."""
 
 
+def add_task_argument(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Add `TASK`."""
+    parser.add_argument(
+        "task",
+        nargs="?" if optional else None,
+        help="a task file, or the name of a task that comes with petrobot",
+    )
+
+
 def add_services_argument(parser: argparse.ArgumentParser) -> None:
     """Add `--services FILE`, the same for all commands."""
     parser.add_argument(
@@ -56,6 +67,31 @@ def add_estimates_argument(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="an estimates file (`run --learn FILE` keeps it) or a campaign's folder: its "
         "measurements replace the estimates declared in the task",
+    )
+
+
+def add_seed_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--seed S` of commands whose result is the same each time."""
+    parser.add_argument(
+        "--seed",
+        type=whole(0, LARGEST_SEED),
+        default=1,
+        metavar="S",
+        help="seed of all random numbers (default: %(default)s)",
+    )
+
+
+def add_mock_argument(parser: argparse.ArgumentParser) -> None:
+    """Add `--mock FILE`."""
+    parser.add_argument(
+        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
+    )
+
+
+def add_json_argument(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--json FILE`, which `write_json` writes."""
+    parser.add_argument(
+        "--json", metavar="FILE", help=f"write {what} as JSON (- for standard output)"
     )
 
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli.loading import (
+    add_json_argument,
     add_services_argument,
     load_directory,
     tell_of_demo,
@@ -33,9 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="how long to wait for answers (default: %(default)s s)",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the answers as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the answers")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.loading import add_json_argument, write_json
 from petrobot.coordinator.cli.options import add_runs_argument
 
 if TYPE_CHECKING:
@@ -137,9 +137,7 @@ class OperatorCommand:
                 help="ask the operator who holds the controls to hand them over, and wait up to "
                 "S seconds (default: %(const)g)",
             )
-        parser.add_argument(
-            "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
-        )
+        add_json_argument(parser, "the answer")
 
     def run(self, options: argparse.Namespace) -> int:
         """Send the command and print its answer. Raises CommandError (1 or 2) if it is refused."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.loading import add_json_argument, write_json
 from petrobot.coordinator.cli.options import recorded
 
 EXAMPLE = "petrobot replay last"
@@ -15,9 +15,7 @@ EXAMPLE = "petrobot replay last"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the outcome as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the outcome")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import load_task, pictures_of, write_json
+from petrobot.coordinator.cli.loading import add_json_argument, load_task, pictures_of, write_json
 from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -56,11 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="the page (default: report.html beside what it is about)",
     )
-    parser.add_argument(
-        "--json",
-        metavar="FILE",
-        help="write the comparison's numbers as JSON (- for standard output)",
-    )
+    add_json_argument(parser, "the comparison's numbers")
 
 
 def run(options: argparse.Namespace) -> int:

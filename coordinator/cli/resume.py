@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli.loading import write_json
 from petrobot.coordinator.cli.options import add_log_level_argument, recorded
-from petrobot.coordinator.cli.run import add_page_arguments, conduct, refuse_stopped
+from petrobot.coordinator.cli.run import (
+    add_output_arguments,
+    add_page_arguments,
+    conduct,
+    refuse_stopped,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,12 +35,7 @@ EXAMPLE = "petrobot resume last --json out.json"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
-    )
-    parser.add_argument(
-        "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
-    )
+    add_output_arguments(parser)
     parser.add_argument(
         "--up",
         action="store_true",

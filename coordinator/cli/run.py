@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_dry_run_argument,
+    add_json_argument,
+    add_mock_argument,
     add_services_argument,
     cell_path,
     load_directory,
@@ -38,13 +40,7 @@ from petrobot.coordinator.cli.options import (
     tidy,
 )
 from petrobot.coordinator.operator.task_check import cell_of
-from petrobot.services.host.command_line import (
-    LARGEST_SEED,
-    MOST_RUNS,
-    number,
-    probability,
-    whole,
-)
+from petrobot.services.host.command_line import LARGEST_SEED, MOST_RUNS, number, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.session import LearningSetting
@@ -88,6 +84,22 @@ REFUSED = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    _add_task_arguments(parser)
+    _add_cell_arguments(parser)
+    add_learning_arguments(parser)
+    add_start_from_arguments(parser)
+    add_output_arguments(parser)
+    add_journal_arguments(parser)
+    add_page_arguments(parser)
+    add_log_level_argument(parser)
+    parser.add_argument(
+        "--quiet", action="store_true", help="no progress, and no search of the net for faults"
+    )
+    add_services_argument(parser)
+    parser.set_defaults(folder=None)
+
+
+def _add_task_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task",
         nargs="?",
@@ -124,6 +136,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TASK=ACTION",
         help="always use this action for this primitive task",
     )
+
+
+def _add_cell_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--processes",
         type=int,
@@ -142,27 +157,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="start the nodes of this host for this run, and stop them after it",
     )
     add_dry_run_argument(parser)
-    parser.add_argument(
-        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
-    )
-    add_learning_arguments(parser)
-    add_start_from_arguments(parser)
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
-    )
+    add_mock_argument(parser)
+
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add `--json` and `--report`."""
+    add_json_argument(parser, "the result")
     parser.add_argument(
         "--report", metavar="FOLDER", type=Path, help="write a report into this folder"
     )
-    add_journal_arguments(parser)
-    add_page_arguments(parser)
-    add_log_level_argument(parser)
-    parser.add_argument(
-        "--quiet",
-        action="store_true",
-        help="no progress, and no search of the net for faults",
-    )
-    add_services_argument(parser)
-    parser.set_defaults(folder=None)
 
 
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
@@ -269,8 +272,7 @@ def run(options: argparse.Namespace) -> int:
     directory = load_directory(cell_path(options.services, options.task, task), options.dry_run)
     if options.join and (not lockstep or options.processes != 0):
         raise CommandError(
-            2,
-            "--join needs --mode lockstep --processes 0; in real time, nodes are always joined",
+            2, "--join needs --mode lockstep --processes 0; in real time, nodes are always joined"
         )
     _refuse_unfit(task, directory)
     if (lockstep or options.up) and not options.join:
@@ -296,9 +298,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def conduct(
-    make: Callable[[Sequence[Observer]], RunSession],
-    options: argparse.Namespace,
-    mode: str,
+    make: Callable[[Sequence[Observer]], RunSession], options: argparse.Namespace, mode: str
 ) -> int:
     """Make a session, lead it to its end, print and write its result. Return the exit code."""
     from petrobot.coordinator.cli.output import give
@@ -331,7 +331,7 @@ def conduct(
     except KeyboardInterrupt:
         folder = made[0].folder if made and made[0].mission.executor.finished is None else None
         if folder is not None and folder.exists():  # one that had not begun leaves none
-            up = " --up" * getattr(options, "up", False)
+            up = " --up" * options.up
             print(f"`petrobot resume {folder}{up}` continues this run", file=sys.stderr)
         raise
     except MissionError as fault:
@@ -376,8 +376,7 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
         importlib.import_module(module)
     directory = session.mission.executor.directory
     try:
-        up = getattr(options, "up", False)
-        async with local_nodes(directory, mock=options.mock) if up else nullcontext():
+        async with local_nodes(directory, mock=options.mock) if options.up else nullcontext():
             await session.connect()
             async with _page(session, options):
                 with progress(options) as watch:
@@ -468,12 +467,7 @@ def refuse_stopped(directory: Directory) -> None:
 
 
 def _request(task: Task, directory: Directory, options: argparse.Namespace) -> RunRequest:
-    from petrobot.coordinator.operator.prepare import (
-        JOINED,
-        LAUNCHED,
-        ONE_PROCESS,
-        RunRequest,
-    )
+    from petrobot.coordinator.operator.prepare import JOINED, LAUNCHED, ONE_PROCESS, RunRequest
 
     chosen = pairs("--use", options.use, "TASK=ACTION")
     for primitive, action in chosen.items():

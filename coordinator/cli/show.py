@@ -11,6 +11,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
     add_services_argument,
+    add_task_argument,
     cell_finder,
     load_task,
     measurements,
@@ -28,7 +29,7 @@ EXAMPLE = "petrobot show catch_ball --errors --out catch_ball.svg"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
+    add_task_argument(parser)
     parser.add_argument("--errors", action="store_true", help="draw the error branches too")
     parser.add_argument(
         "--inside", metavar="MACRO", default="", help="draw what is inside a macro place"

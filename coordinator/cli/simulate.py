@@ -8,13 +8,15 @@ from typing import Any
 
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
+    add_json_argument,
+    add_seed_argument,
     add_services_argument,
     cell_finder,
     measurements,
     task_path,
     told_if_slow,
 )
-from petrobot.services.host.command_line import LARGEST_SEED, number, whole
+from petrobot.services.host.command_line import number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 
@@ -42,13 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="stop each simulation after S simulated seconds; needed for a net that never ends",
     )
-    parser.add_argument(
-        "--seed",
-        type=whole(0, LARGEST_SEED),
-        default=1,
-        metavar="S",
-        help="seed of all random numbers (default: %(default)s)",
-    )
+    add_seed_argument(parser)
     add_estimates_argument(parser)
     add_services_argument(parser)
     parser.add_argument(
@@ -59,9 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CHANGE",
         help="a change, written as for `petrobot analyse`; may be repeated",
     )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
-    )
+    add_json_argument(parser, "the answer")
 
 
 def run(options: argparse.Namespace) -> int:

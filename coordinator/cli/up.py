@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NoReturn
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
     add_dry_run_argument,
+    add_mock_argument,
     add_services_argument,
     load_directory,
     refuse_misplaced,
@@ -54,9 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="lock step: how long to wait for a coordinator that died to be resumed (default: "
         "%(default)g s of wall time)",
     )
-    parser.add_argument(
-        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
-    )
+    add_mock_argument(parser)
     add_dry_run_argument(parser)
     parser.add_argument("--no-respawn", action="store_true", help="do not restart a node that died")
     parser.add_argument(

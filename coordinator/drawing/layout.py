@@ -144,10 +144,7 @@ class Layers:
         self._exchange()
 
     def _sort(
-        self,
-        column: list[Spot],
-        inward: Mapping[Spot, Sequence[Spot]],
-        row: Mapping[Spot, int],
+        self, column: list[Spot], inward: Mapping[Spot, Sequence[Spot]], row: Mapping[Spot, int]
     ) -> None:
         mean = {
             s: sum(row[n] for n in inward[s]) / len(inward[s]) if inward[s] else row[s]

@@ -201,16 +201,16 @@ def _fire_until_stable(draft: Draft, policy: Policy, current: Suspended) -> None
         if not step or _breaks(draft, current, step):
             return
         limit = 1 if draft.mode is Mode.STEPPING else len(step)
-        entered = draft.run_order, draft.snapshot()
+        entered = draft.run_order
         written = [_new_values(draft, fireable) for fireable in step[:limit]]
         for fireable in step[:limit]:
             fire(draft, fireable, current.cause)
         if draft.compiled.setting:
             _set_variables(draft, dict(pair for pairs in written for pair in pairs))
-            take_arguments(draft, entered[0])
+            take_arguments(draft, entered)
         if draft.mode is Mode.STEPPING:
             _end_single_step(draft, current, step)
-        elif not _stops_after(draft, policy, entered[1], step):
+        elif not _stops_after(draft, policy, step):
             current = Suspended("", "stability")
             continue
         return
@@ -273,7 +273,7 @@ def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> Non
     admit(draft)
 
 
-def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: list[Match]) -> bool:
+def _stops_after(draft: Draft, policy: Policy, step: list[Match]) -> bool:
     """Pause after a token entered a place with a breakpoint, and give up on endless firings. Return
     whether the step stops here."""
     places = draft.compiled.net.places

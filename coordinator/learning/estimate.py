@@ -20,13 +20,7 @@ from hashlib import blake2b
 from math import sqrt
 from typing import Any, NamedTuple
 
-from petrobot.coordinator.learning.statistics import (
-    EMPTY,
-    Moments,
-    merged,
-    whole,
-    wilson,
-)
+from petrobot.coordinator.learning.statistics import EMPTY, Moments, merged, whole, wilson
 from petrobot.coordinator.task import Executed, Status
 
 SIZE = 512

@@ -415,10 +415,7 @@ class LearningSelector(FirstAlternative):
         self._credit(trial, trial.runs)
 
     def _credit(
-        self,
-        trial: _Trial,
-        runs: Sequence[tuple[str, str, str, Observation]],
-        late: bool = False,
+        self, trial: _Trial, runs: Sequence[tuple[str, str, str, Observation]], late: bool = False
     ) -> None:
         """Record the verdict on the actions of these runs, if the task is to judge them."""
         if self.learning.credit != TASK:

@@ -184,9 +184,7 @@ def objective(reliability: float, cost: float, rho: float, availability: float =
 
 
 def admitted(
-    by_scenario: Mapping[str, Tally],
-    target: float | None,
-    level: float = 0.95,
+    by_scenario: Mapping[str, Tally], target: float | None, level: float = 0.95
 ) -> tuple[str, ...]:
     """Return the scenarios in which the lower confidence bound of an action's R reaches the target;
     without a target, all scenarios with runs."""

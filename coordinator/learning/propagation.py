@@ -30,12 +30,7 @@ from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.objective import (
-    Comparison,
-    Question,
-    compare,
-    objective,
-)
+from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
 from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
 
@@ -459,7 +454,6 @@ def propagate(
     task: Task,
     estimates: Estimates,
     context: str | None = None,
-    choice: ChoiceShares | None = None,
     *,
     questions: Mapping[str, Question] | None = None,
     rho: float | None = None,
@@ -479,7 +473,7 @@ def propagate(
             asked[name] = replace(asked[name], declared=tuple(primitive.costs.items()))
     scenarios = [context] if context is not None else _scenarios(task, estimates)
     where: Sequence[str | None] = scenarios or [None]
-    solved = [(_solve(task, measured_from(task, estimates, w, choice)), w) for w in where]
+    solved = [(_solve(task, measured_from(task, estimates, w)), w) for w in where]
     hardest = min(solved, key=lambda one: (one[0].solved.conjunctive_reliability, one[1] or ""))
     # The lowest of m: intervals at 1 - (1 - level) / m pay for the choice (Bonferroni).
     return _figures(task, estimates, *hardest, asked, context, rho, len(where))
@@ -669,11 +663,7 @@ def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Esti
 
 
 def _part(
-    name: str,
-    judged: Comparison,
-    shares: Mapping[str, float],
-    question: Question,
-    runs: float,
+    name: str, judged: Comparison, shares: Mapping[str, float], question: Question, runs: float
 ) -> tuple[PrimitiveFigures, dict[str, Uncertain]] | None:
     """Return the figures of a primitive task and the cost of each alternative; None if no
     alternative that is chosen was measured."""

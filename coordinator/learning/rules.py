@@ -128,12 +128,6 @@ POINTS = 512
 forecasts."""
 
 
-def _follow(batch: Batch, eligible: Mask | None) -> None:
-    """Put all of p on the action that a bandit rule recommends now; displays and frozen selectors
-    read it."""
-    batch.p[:] = one_hot(batch.best(eligible), batch.n)
-
-
 def _allowed(batch: Batch, offered: Mask) -> Mask:
     """Return the offered actions that a target reliability does not rule out; all offered ones if
     it rules out every one of them."""
@@ -142,31 +136,31 @@ def _allowed(batch: Batch, offered: Mask) -> Mask:
     return np.where(left.any(axis=1, keepdims=True), left, offered)
 
 
-def _begin(rows: int, n: int, rho: float | None) -> Batch:
-    batch = Batch.fresh(rows, n, rho)
-    batch.own["ruled_out"] = np.zeros((rows, n))
-    return batch
+class _Bandit(Rule):
+    """Its p only recommends; displays and frozen selectors read it."""
 
+    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
+        """Create learners without any experience."""
+        batch = Batch.fresh(rows, n, rho)
+        batch.own["ruled_out"] = np.zeros((rows, n))
+        return batch
 
-def _learn(batch: Batch, trial: Response, eligible: Mask | None) -> None:
-    batch.counting(trial)
-    if eligible is not None:
-        batch.own["ruled_out"][:] = ~eligible
-    _follow(batch, eligible)
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
+        """Count the trial and update the recommendation."""
+        batch.counting(trial)
+        if eligible is not None:
+            batch.own["ruled_out"][:] = ~eligible
+        batch.p[:] = one_hot(batch.best(eligible), batch.n)
 
 
 @dataclass(frozen=True)
-class UCB1(Rule):
+class UCB1(_Bandit):
     """Choose the action with the largest mean payoff + sqrt(width * 2 ln k / n_a). The payoff is an
     affine function of J in [0, 1]."""
 
     name: str = "ucb1"
     width: float = 1.0
     """Scale of the bonus; 1 is Auer's bound for arbitrary payoffs in [0, 1]."""
-
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners without any experience."""
-        return _begin(rows, n, rho)
 
     def index(self, batch: Batch) -> Array:
         """Return the upper confidence bound of the mean payoff of each action; inf where it was
@@ -196,10 +190,6 @@ class UCB1(Rule):
         bound = np.where(_allowed(batch, offered), self.index(batch), -np.inf)
         return np.where(owed, least, np.argmax(bound, axis=1))
 
-    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Count the trial and update the recommendation."""
-        _learn(batch, trial, eligible)
-
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Give the upper bound."""
         bound = float(self.index(batch)[0, action])
@@ -209,15 +199,11 @@ class UCB1(Rule):
 
 
 @dataclass(frozen=True)
-class Thompson(Rule):
+class Thompson(_Bandit):
     """Draw R of each action from its posterior Beta(1 + successes, 1 + other runs) and choose the
     lowest J. Costs enter as their means."""
 
     name: str = "thompson"
-
-    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Create learners with a uniform prior for each R."""
-        return _begin(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Estimate the choice probabilities at fixed points of a low-discrepancy sequence, so that
@@ -243,10 +229,6 @@ class Thompson(Rule):
         lowest: Index = np.argmin(np.where(_allowed(batch, offered), j, np.inf), axis=1)
         return lowest
 
-    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Count the trial and update the recommendation."""
-        _learn(batch, trial, eligible)
-
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Give the posterior distribution."""
         good, runs = batch.successes[0, action], batch.runs[0, action]
@@ -266,8 +248,26 @@ def _plastic(n: int) -> float:
 # --- learning automata ---
 
 
+class _TriesFirst(Rule):
+    """Each action is first chosen `trials` times, so that the estimates mean something."""
+
+    trials: int
+
+    def tried(self, batch: Batch, offered: Mask, then: Array) -> Array:
+        """Return 1 for the action that still needs one of its first trials; later `then`."""
+        owed, least = forced(batch, offered, self.trials)
+        return np.where(owed[:, None], one_hot(least, batch.n), then)
+
+    def says(self, batch: Batch, offered: Mask, action: int) -> str:
+        """Say which of its first trials this is, or with which probability it was drawn."""
+        owed, _ = forced(batch, offered, self.trials)
+        if owed[0]:
+            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}"
+        return super().says(batch, offered, action)
+
+
 @dataclass(frozen=True)
-class NikolicFu(Rule):
+class NikolicFu(_TriesFirst):
     """The scheme of the paper: estimate R and C of the chosen action, order all actions by J, and
     move p towards the best one: p_i += gamma_k (lambda_i - p_i), where lambda is 1 at the lowest J
     and 0 elsewhere, and gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
@@ -320,11 +320,7 @@ class NikolicFu(Rule):
         if self.mixing:
             eps = self.exploration(batch)
             mixed = (1 - eps) * batch.p + eps * self.explored(batch)
-        mixed = restricted(mixed, offered)
-        if not self.trials:
-            return mixed
-        owed, least = forced(batch, offered, self.trials)
-        return np.where(owed[:, None], one_hot(least, batch.n), mixed)
+        return self.tried(batch, offered, restricted(mixed, offered))
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Update the estimates, order the actions by J, move p towards the best one."""
@@ -333,13 +329,11 @@ class NikolicFu(Rule):
         batch.p += self.gain(batch.k)[:, None] * (target - batch.p)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Say which of its first trials this is, or with which probability it was drawn."""
-        owed, _ = forced(batch, offered, self.trials)
-        if owed[0]:
-            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}"
-        share = self.probabilities(batch, offered)[0, action]
+        """Also say how much is explored, after the first trials."""
         eps = float(self.exploration(batch)[0, 0])
-        return f"drawn with {share:.3f}" + (f", exploring {eps:.2f}" if eps else "")
+        tried = not forced(batch, offered, self.trials)[0][0]
+        exploring = f", exploring {eps:.2f}" if eps and tried else ""
+        return super().says(batch, offered, action) + exploring
 
 
 @dataclass(frozen=True)
@@ -370,7 +364,7 @@ class RewardInaction(Rule):
 
 
 @dataclass(frozen=True)
-class DiscretisedPursuit(Rule):
+class DiscretisedPursuit(_TriesFirst):
     """DP_R-I: after each success, move p in steps of 1 / (n * resolution) towards the action with
     the lowest J.
 
@@ -384,8 +378,7 @@ class DiscretisedPursuit(Rule):
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
         """Return p over the offered actions; 1 for the action that still needs one of its first
         trials."""
-        owed, least = forced(batch, offered, self.trials)
-        return np.where(owed[:, None], one_hot(least, batch.n), restricted(batch.p, offered))
+        return self.tried(batch, offered, restricted(batch.p, offered))
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Move p towards the best estimate if the trial succeeded and all first trials are done."""
@@ -401,20 +394,13 @@ class DiscretisedPursuit(Rule):
         rewarded = (trial.success > 0) & trial.executed & over
         batch.p = np.where(rewarded[:, None], moved, batch.p)
 
-    def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Say which of its first trials this is, or with which probability it was drawn."""
-        owed, _ = forced(batch, offered, self.trials)
-        if owed[0]:
-            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}"
-        return super().says(batch, offered, action)
-
 
 # CUSUM sums of the change test: one for each direction of each observed quantity.
 TESTS = ("success_up", "success_down", "cost_up", "cost_down")
 
 
 @dataclass(frozen=True)
-class Tracking(Rule):
+class Tracking(_TriesFirst):
     """The scheme of Nikolic and Fu for a changing world. It follows changes, and therefore does not
     converge with probability 1.
 
@@ -458,9 +444,7 @@ class Tracking(Rule):
         else:
             floor = min(self.probability_floor, 1.0 / batch.n)
             raised = (1 - floor * batch.n) * batch.p + floor
-        mixed = restricted(raised, offered)
-        owed, least = forced(batch, offered, self.trials)
-        return np.where(owed[:, None], one_hot(least, batch.n), mixed)
+        return self.tried(batch, offered, restricted(raised, offered))
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Fade the sums, update the estimates, test for a change, order the actions by J, move
@@ -510,10 +494,7 @@ class Tracking(Rule):
         batch.k[alarm] = 1.0
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Say which of its first trials since the restart this is, or with which probability it was
-        drawn."""
+        """Also say how many changes of the world it noticed: each begins its first trials again."""
         restarts = batch.own["restarts"][0, 0]
         since = f", {restarts:g} changes of the world noticed" if restarts else ""
-        if forced(batch, offered, self.trials)[0][0]:
-            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}{since}"
-        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}{since}"
+        return super().says(batch, offered, action) + since

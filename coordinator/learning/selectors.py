@@ -390,10 +390,7 @@ def credited(name: str, credit: str) -> str:
 
 
 def make(
-    name: str,
-    actions: Iterable[str],
-    question: Question | None = None,
-    credit: str = ACTION,
+    name: str, actions: Iterable[str], question: Question | None = None, credit: str = ACTION
 ) -> RuleSelector:
     """Create a selector by its name. Raises ValueError for an unknown one."""
     if name not in RULES:

@@ -37,7 +37,7 @@ from petrobot.coordinator.engine import (
 )
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.observation import Shell, TrialWatch, Watching, shown_selectors
-from petrobot.coordinator.operator.port import Answer, Controls, Feed, refusal
+from petrobot.coordinator.operator.port import Answer, Controls, Feed, Followed, refusal
 from petrobot.coordinator.operator.run_state import ChangePublisher
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
@@ -67,7 +67,7 @@ class Shown:
         self.trials = TrialWatch(task, directory, feed)
 
 
-class Operation:
+class Operation(Followed):
     """One mission run as its operators see it; `name` is shown in the snapshot."""
 
     def __init__(
@@ -166,14 +166,6 @@ class Operation:
         return self.executor.directory.where(action)
 
     # --- the port -----------------------------------------------------------------------------
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return the current state."""
-        return self.feed.snapshot()
-
-    def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Call `receive` with every later change."""
-        return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
         """Carry out a command; return its answer after it is journaled."""

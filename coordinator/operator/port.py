@@ -144,6 +144,20 @@ class Feed:
         return stop
 
 
+class Followed:
+    """What clients can follow: a mission run, or the coordinator of a cell."""
+
+    feed: Feed
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the current state."""
+        return self.feed.snapshot()
+
+    def subscribe(self, receive: Receive) -> Callable[[], None]:
+        """Call `receive` with every later change."""
+        return self.feed.subscribe(receive)
+
+
 # --- controls ---
 # One operator holds them, the others watch and may ask for them. They outlive mission runs.
 

@@ -42,25 +42,14 @@ from petrobot.coordinator.operator.session import (
     RealtimeSession,
     RunSession,
 )
-from petrobot.coordinator.operator.start_from import (
-    AGAIN,
-    Recorded,
-    departed,
-    departing,
-    departure,
-)
+from petrobot.coordinator.operator.start_from import AGAIN, Recorded, departed, departing, departure
 from petrobot.coordinator.run.folder import DEFAULT, JOURNAL, header
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
 from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore, RetracingStore, clock_reading
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import dumps
-from petrobot.services.comm.location_file import (
-    FIRST_PHYSICS,
-    Directory,
-    physics_of,
-    same_physics,
-)
+from petrobot.services.comm.location_file import FIRST_PHYSICS, Directory, physics_of, same_physics
 
 SEED: Final = 1
 ONE_PROCESS, LAUNCHED, JOINED = "one process", "launched", "joined"
@@ -245,7 +234,7 @@ def _resumed(found: Recorded, observers: Sequence[Observer], ordered: float) -> 
         found.directory, found.task, found.engine, found.journal, replayed, now, selector, see
     )
     if lockstep:
-        member, party = lockstep_member(found.directory, mission, None, begin)
+        member, party = lockstep_member(found.directory, mission, begin)
         return LockstepSession(party, selector, learning, folder, member=member, resumed=True)
     return RealtimeSession(
         found.directory,

@@ -20,7 +20,7 @@ from petrobot.coordinator.learning.estimates_file import EstimatesError
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.observation import shown_selectors
-from petrobot.coordinator.operator.port import Answer, Controls, Feed, refusal
+from petrobot.coordinator.operator.port import Answer, Controls, Feed, Followed, refusal
 from petrobot.coordinator.operator.prepare import RunRequest, prepare, prepare_from
 from petrobot.coordinator.operator.run_address import RunAddress
 from petrobot.coordinator.operator.run_state import ChangePublisher
@@ -57,7 +57,7 @@ OVER = frozenset({"success", "failure", "error", "aborted", "stopped"})
 """States of a mission run that has ended."""
 
 
-class Station:
+class Station(Followed):
     """The coordinator of one cell; `runs` is the folder of journals, `address` gives the address
     that each run writes to its folder."""
 
@@ -110,14 +110,6 @@ class Station:
         await asyncio.gather(going, return_exceptions=True)
 
     # --- the port -----------------------------------------------------------------------------
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return the current state."""
-        return self.feed.snapshot()
-
-    def subscribe(self, receive: Callable[[dict[str, Any]], None]) -> Callable[[], None]:
-        """Call `receive` with every later change."""
-        return self.feed.subscribe(receive)
 
     async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
         """Carry out a command; pass those about the active run to the run."""

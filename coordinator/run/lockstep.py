@@ -70,7 +70,6 @@ class CoordinatorParty:
         self,
         directory: Directory,
         mission: Mission,
-        watch: Callable[[float], None] | None = None,
         begin: Callable[[float], None] | None = None,
     ) -> None:
         self.name = NAME
@@ -82,7 +81,7 @@ class CoordinatorParty:
         self._look = LOOK
         self._waiting = _Waiting(mission.executor.engine)
         mission.executor.observers.append(self._waiting)
-        self.watch = watch
+        self.watch: Callable[[float], None] | None = None
         self._begin = begin or mission.start
         self._now = 0.0
         self._nodes: dict[str, str] = {}

@@ -10,15 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from petrobot.coordinator.task.conditions import Expression
-from petrobot.coordinator.task.elements import (
-    Counts,
-    End,
-    Event,
-    Input,
-    Kind,
-    Scope,
-    Transition,
-)
+from petrobot.coordinator.task.elements import Counts, End, Event, Input, Kind, Scope, Transition
 from petrobot.coordinator.task.model import Task
 from petrobot.coordinator.task.net import Arcs, Changes, Net, Thresholds
 from petrobot.coordinator.task.validation import is_pulse

@@ -412,9 +412,7 @@ def _place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
             yield Fault(f"{key}.subnet", f"unknown subnet {p.subnet!r}", remedy)
         if p.tokens or p.capacity is not None:
             yield Fault(
-                key,
-                "a macro place cannot hold tokens",
-                "put them into the places inside it",
+                key, "a macro place cannot hold tokens", "put them into the places inside it"
             )
     elif p.subnet:
         yield Fault(
@@ -663,10 +661,7 @@ def _macro_exits(task: Task) -> Iterator[Fault]:
 
 
 def _expression(
-    key: str,
-    expression: Expression,
-    domains: Mapping[str, Domain],
-    places: Collection[str] = (),
+    key: str, expression: Expression, domains: Mapping[str, Domain], places: Collection[str] = ()
 ) -> Iterator[Fault]:
     unknown = sorted(expression.names - domains.keys())
     remedy = f"it may read {few(sorted(domains)) or 'variables and parameters'}" if unknown else ""

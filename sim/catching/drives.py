@@ -22,14 +22,7 @@ from petrobot.services.comm.canopen.cia402 import (
     to_units,
 )
 from petrobot.sim.bus.canopen_node import CanopenNode
-from petrobot.sim.bus.power_drive import (
-    ENABLE,
-    ENABLE_MASK,
-    POWERED,
-    RUNNING,
-    DriveBus,
-    PowerDrive,
-)
+from petrobot.sim.bus.power_drive import ENABLE, ENABLE_MASK, POWERED, RUNNING, DriveBus, PowerDrive
 
 # --- the position loop of one drive ---
 

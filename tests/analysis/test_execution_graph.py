@@ -682,6 +682,7 @@ def philosophers(n: int, steps: int) -> Task:
 def test_a_dead_end_far_behind_many_states_is_found() -> None:
     """Eight arms take their first forks at the same time, after 24 steps. Neither breadth
     first nor plays that draw each stimulus by chance come there within this limit."""
-    x = execute(philosophers(8, 2), limit=20_000, free_choice=True)
+    task = philosophers(8, 2)
+    x = execute(task, limit=20_000, engine=Engine(task, policy=Policy(ask_undecided=True)))
     assert not x.complete and x.dead.any()
     assert len(x.path(int(np.flatnonzero(x.dead)[0]))) >= 20

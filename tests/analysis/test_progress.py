@@ -71,6 +71,11 @@ class Case:
         return make_task(self.places, self.net, self.events, final=self.final, **(self.more or {}))
 
 
+KEEPS_THE_ARM = {
+    "next": {"in": "parts arm", "out": "look"},
+    "seen": {"in": "look:normal", "out": "arm"},
+    "dropped": {"in": "look:error", "out": "bin"},
+}
 STUCK: dict[str, Case] = {
     "an ended run waits for a token that does not come back": Case(
         "arm~=1 parts=2 tray=1 look!",
@@ -105,21 +110,13 @@ STUCK: dict[str, Case] = {
     ),
     "a branch forgets to return the arm": Case(
         "arm~=1 parts=2 bin look!",
-        {
-            "next": {"in": "parts arm", "out": "look"},
-            "seen": {"in": "look:normal", "out": "arm"},
-            "dropped": {"in": "look:error", "out": "bin"},
-        },
+        KEEPS_THE_ARM,
         "parts == 0 and arm == 1",
         ("next needs arm, which is empty: taken by `next`, never returned by `dropped`",),
     ),
     "an error branch ends in a place that nothing takes from": Case(
         "arm~=1 parts=2 bin. look!",
-        {
-            "next": {"in": "parts arm", "out": "look"},
-            "seen": {"in": "look:normal", "out": "arm"},
-            "dropped": {"in": "look:error", "out": "bin"},
-        },
+        KEEPS_THE_ARM,
         "parts == 0 and arm == 1 and bin == 0",
         (
             "next needs arm, which is empty: taken by `next`, still held with bin, and no "

@@ -40,6 +40,7 @@ from petrobot.coordinator.engine import (
     Finished,
     Instruction,
     Mode,
+    Policy,
     RunEnded,
     RunRaised,
     RunRecorded,
@@ -223,7 +224,8 @@ def figures_agree(task: Task, measured: Measured | None = None) -> None:
     the order of waiting or of the file."""
     x = execute(task, limit=STEPS)
     assume(x.complete and not x.livelocks)
-    assume(not execute(task, limit=STEPS, free_choice=True).contests)
+    free = Engine(task, policy=Policy(ask_undecided=True))
+    assume(not execute(task, limit=STEPS, engine=free).contests)
     try:
         chain, view, found = in_both(x, measured)
     except TooLarge:

@@ -49,54 +49,25 @@ goal = "the arm has reached as often as asked"
 final = "jobs == 0 and arm_free == 1"
 final_error = "out_of_order == 1"
 runs_place = "jobs"
-[primitive_tasks.work]
-goal = "the arm has reached"
-alternatives = ["reach", "reach_slowly"]
-deadline = 60.0
-[primitive_tasks.recover]
-goal = "the arm is ready again"
-alternatives = ["recover"]
-deadline = 60.0
+[primitive_tasks]
+work = { goal = "the arm has reached", alternatives = ["reach", "reach_slowly"], deadline = 60.0 }
+recover = { goal = "the arm is ready again", alternatives = ["recover"], deadline = 60.0 }
 [events.part_there]
 scope = "external"
 memory = "latched"
-[places.jobs]
-kind = "control"
-tokens = 2
-capacity = 5
-[places.arm_free]
-kind = "resource"
-tokens = 1
-capacity = 1
-[places.work]
-kind = "action"
-task = "work"
-[places.recover]
-kind = "action"
-task = "recover"
-[places.out_of_order]
-kind = "control"
-capacity = 1
-[transitions.start]
-in = ["jobs", "arm_free"]
-out = ["work"]
-event = "part_there"
-[transitions.nothing_comes]
-in = ["jobs", "arm_free"]
-out = ["arm_free"]
-after = 600.0
-[transitions.done]
-in = ["work:normal"]
-out = ["arm_free"]
-[transitions.failed]
-in = ["work:error"]
-out = ["recover"]
-[transitions.recovered]
-in = ["recover:normal"]
-out = ["arm_free"]
-[transitions.given_up]
-in = ["recover:error"]
-out = ["out_of_order"]
+[places]
+jobs = { kind = "control", tokens = 2, capacity = 5 }
+arm_free = { kind = "resource", tokens = 1, capacity = 1 }
+work = { kind = "action" }
+recover = { kind = "action" }
+out_of_order = { kind = "control", capacity = 1 }
+[transitions]
+start = { in = ["jobs", "arm_free"], out = ["work"], event = "part_there" }
+nothing_comes = { in = ["jobs", "arm_free"], out = ["arm_free"], after = 600.0 }
+done = { in = ["work:normal"], out = ["arm_free"] }
+failed = { in = ["work:error"], out = ["recover"] }
+recovered = { in = ["recover:normal"], out = ["arm_free"] }
+given_up = { in = ["recover:error"], out = ["out_of_order"] }
 """
 
 

@@ -165,20 +165,20 @@ class Frozen(Play):
         """One column for each state."""
         self._tokens = np.array([s.marking for s in states], dtype=np.int64).T.copy()
         known = self._s.first_values
-        self._valuations = [{name: s.variables[name] for name in known} for s in states]
-        self._valuation = np.arange(len(states))
+        self._variables.valuations = [{name: s.variables[name] for name in known} for s in states]
+        self._variables.valuation = np.arange(len(states))
         self.names = dict[tuple[int, int], str]()  # of the runs, by row and column
         for q, place in enumerate(self._s.vocabulary.places):
             for i, state in enumerate(states):
                 for run in state.tokens.get(place, ()):
                     self._enter(q, np.array([i]))
-                    (row,) = (r for r in self._rows[q] if self._entered[r, i] == self._entries)
+                    (row,) = (r for r in self._rows[q] if self._runs.entered[r, i] == self._entries)
                     self.names[row, i] = run.id
                     if run.phase is not Phase.QUEUED:
-                        self._phase[row, i] = DONE if run.phase is Phase.DONE else GOING
+                        self._runs.phase[row, i] = DONE if run.phase is Phase.DONE else GOING
                     if run.status is not None:
-                        self._status[row, i] = STATUSES.index(run.status)
-                        self._ended[row, i] = run.ended
+                        self._runs.status[row, i] = STATUSES.index(run.status)
+                        self._runs.ended[row, i] = run.ended
 
     def agrees(self, task: Task, states: list[State]) -> None:
         """The transitions whose arcs are satisfied are the engine's, and so are the runs that they
@@ -189,7 +189,7 @@ class Frozen(Play):
             unjudged = replace(move, allowed=None, known=None)
             able = self._enabled(unjudged)
             unheard = replace(x, actions=tuple(replace(a, raised=()) for a in x.actions), when=None)
-            held = None if move.known is None else self._holds(move.known)
+            held = None if move.known is None else self._variables.satisfy(move.known)
             for i, state in enumerate(states):
                 if held is not None:
                     assert bool(held[i]) == true_in(move.known, state.variables), move.name
@@ -209,15 +209,15 @@ class Frozen(Play):
             rows = concession(self._s.rule, before, move.number)
             assert not (able & ~rows).any()
             columns = np.flatnonzero(able)
-            phases, taken = self._phase.copy(), self._taken.copy()
-            told = self._valuation.copy()
+            phases, taken = self._runs.phase.copy(), self._taken.copy()
+            told = self._variables.valuation.copy()
             self._fire(move, columns)
-            self._valuation = told
+            self._variables.valuation = told
             for i in columns.tolist():
                 expected = successor(task.net, states[i].marking, move.number)
                 assert tuple(self._tokens[:, i].tolist()) == expected, move.name
             self._tokens, self._taken = before, taken
-            self._phase[: len(phases)], self._phase[len(phases) :] = phases, IDLE
+            self._runs.phase[: len(phases)], self._runs.phase[len(phases) :] = phases, IDLE
 
 
 def forecast_agrees(task: Task, states: list[State]) -> None:

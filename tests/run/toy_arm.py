@@ -31,50 +31,25 @@ schema = 1
 name = "toy"
 final = "done == 1"
 final_error = "broken == 1"
-[primitive_tasks.work]
-goal = "something is moved"
-alternatives = ["do_work"]
-deadline = 5.0
-stop_within = 1.0
-[primitive_tasks.tidy]
-goal = "all is as before"
-alternatives = ["do_tidy"]
-deadline = 3.0
+[primitive_tasks]
+work = { goal = "a part is moved", alternatives = ["do_work"], deadline = 5.0, stop_within = 1.0 }
+tidy = { goal = "all is as before", alternatives = ["do_tidy"], deadline = 3.0 }
 [events.bell]
 scope = "external"
 memory = "latched"
-[places.begin]
-kind = "control"
-tokens = 1
-[places.work]
-kind = "action"
-task = "work"
-[places.tidy]
-kind = "action"
-task = "tidy"
-[places.done]
-kind = "control"
-[places.broken]
-kind = "control"
-[transitions.go]
-in = ["begin"]
-out = ["work"]
-[transitions.rung]
-in = ["work:preempt=success"]
-out = ["tidy"]
-event = "bell"
-[transitions.worked]
-in = ["work:normal"]
-out = ["tidy"]
-[transitions.failed]
-in = ["work:error"]
-out = ["tidy"]
-[transitions.tidied]
-in = ["tidy:normal"]
-out = ["done"]
-[transitions.not_tidied]
-in = ["tidy:error"]
-out = ["broken"]
+[places]
+begin = { kind = "control", tokens = 1 }
+work = { kind = "action" }
+tidy = { kind = "action" }
+done = { kind = "control" }
+broken = { kind = "control" }
+[transitions]
+go = { in = ["begin"], out = ["work"] }
+rung = { in = ["work:preempt=success"], out = ["tidy"], event = "bell" }
+worked = { in = ["work:normal"], out = ["tidy"] }
+failed = { in = ["work:error"], out = ["tidy"] }
+tidied = { in = ["tidy:normal"], out = ["done"] }
+not_tidied = { in = ["tidy:error"], out = ["broken"] }
 """
 SERVICES = """
 schema = 1

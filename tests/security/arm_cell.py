@@ -75,45 +75,21 @@ goal = "the arm has swept as often as asked"
 final = "sweeps == 0 and arm_free == 1"
 final_error = "out_of_order == 1"
 runs_place = "sweeps"
-[primitive_tasks.move]
-goal = "swept"
-alternatives = ["sweep"]
-deadline = 120.0
-[primitive_tasks.make_ready]
-goal = "the drives are enabled, the arm is at home"
-alternatives = ["ready"]
-deadline = 60.0
-[places.sweeps]
-kind = "control"
-tokens = 1
-[places.arm_free]
-kind = "resource"
-tokens = 1
-capacity = 1
-[places.move]
-kind = "action"
-task = "move"
-[places.make_ready]
-kind = "action"
-task = "make_ready"
-[places.out_of_order]
-kind = "control"
-capacity = 1
-[transitions.start]
-in = ["sweeps", "arm_free"]
-out = ["move"]
-[transitions.done]
-in = ["move:normal"]
-out = ["arm_free"]
-[transitions.failed]
-in = ["move:error"]
-out = ["make_ready"]
-[transitions.recovered]
-in = ["make_ready:normal"]
-out = ["arm_free"]
-[transitions.given_up]
-in = ["make_ready:error"]
-out = ["out_of_order"]
+[primitive_tasks]
+move = { goal = "swept", alternatives = ["sweep"], deadline = 120.0 }
+make_ready = { goal = "enabled, at home", alternatives = ["ready"], deadline = 60.0 }
+[places]
+sweeps = { kind = "control", tokens = 1 }
+arm_free = { kind = "resource", tokens = 1, capacity = 1 }
+move = { kind = "action" }
+make_ready = { kind = "action" }
+out_of_order = { kind = "control", capacity = 1 }
+[transitions]
+start = { in = ["sweeps", "arm_free"], out = ["move"] }
+done = { in = ["move:normal"], out = ["arm_free"] }
+failed = { in = ["move:error"], out = ["make_ready"] }
+recovered = { in = ["make_ready:normal"], out = ["arm_free"] }
+given_up = { in = ["make_ready:error"], out = ["out_of_order"] }
 """
 
 

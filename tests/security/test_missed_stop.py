@@ -40,50 +40,22 @@ name = "turns"
 runs_place = "turns"
 final = "turns == 0 and free == 1"
 {more}
-[primitive_tasks.fetch]
-goal = "fetched"
-alternatives = ["left_fetch"]
-deadline = 3.0
-[primitive_tasks.carry]
-goal = "carried"
-alternatives = ["right_carry"]
-deadline = 3.0
-[places.turns]
-kind = "control"
-tokens = 1
-[places.free]
-kind = "resource"
-tokens = 1
-capacity = 1
-[places.fetch]
-kind = "action"
-task = "fetch"
-[places.laid]
-kind = "control"
-capacity = 1
-[places.carry]
-kind = "action"
-task = "carry"
-[transitions.begin]
-in = ["turns", "free"]
-out = ["fetch"]
-after = {pause}
-[transitions.fetched]
-in = ["fetch:normal"]
-out = ["laid"]
-[transitions.go_on]
-in = ["laid"]
-out = ["carry"]
-after = 0.02
-[transitions.carried]
-in = ["carry:normal"]
-out = ["free"]
-[transitions.not_fetched]
-in = ["fetch:error"]
-out = ["free"]
-[transitions.not_carried]
-in = ["carry:error"]
-out = ["free"]
+[primitive_tasks]
+fetch = {{ goal = "fetched", alternatives = ["left_fetch"], deadline = 3.0 }}
+carry = {{ goal = "carried", alternatives = ["right_carry"], deadline = 3.0 }}
+[places]
+turns = {{ kind = "control", tokens = 1 }}
+free = {{ kind = "resource", tokens = 1, capacity = 1 }}
+fetch = {{ kind = "action" }}
+laid = {{ kind = "control", capacity = 1 }}
+carry = {{ kind = "action" }}
+[transitions]
+begin = {{ in = ["turns", "free"], out = ["fetch"], after = {pause} }}
+fetched = {{ in = ["fetch:normal"], out = ["laid"] }}
+go_on = {{ in = ["laid"], out = ["carry"], after = 0.02 }}
+carried = {{ in = ["carry:normal"], out = ["free"] }}
+not_fetched = {{ in = ["fetch:error"], out = ["free"] }}
+not_carried = {{ in = ["carry:error"], out = ["free"] }}
 """
 PREPARATION = """\
 from pathlib import Path

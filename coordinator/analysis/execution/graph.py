@@ -41,7 +41,6 @@ from petrobot.coordinator.engine import (
     Fired,
     Instruction,
     Mode,
-    Policy,
     Report,
     RunEnded,
     RunRaised,
@@ -343,19 +342,18 @@ def execute(
     task: Task,
     *,
     limit: int = STEPS,
-    free_choice: bool = False,
     engine: Engine | None = None,
     contests: Iterable[tuple[str, ...]] | None = None,
     shared: Shared | None = None,
 ) -> ExecutionGraph:
     """Explore the execution graph of a task, up to a limit in stimuli and firings.
 
-    With `free_choice`, any transition may win a conflict that neither priority nor weight decides.
-    `contests` are the transitions of each such conflict, if they are known; then only their order
-    of waiting distinguishes states. `shared`: what searches of this task have found before, also
-    with other numbers of runs. Raises TooManyValues.
+    `engine`: with its policy `ask_undecided`, any transition may win a conflict that neither
+    priority nor weight decides. `contests` are the transitions of each such conflict, if they are
+    known; then only their order of waiting distinguishes states. `shared`: what searches of this
+    task have found before, also with other numbers of runs. Raises TooManyValues.
     """
-    engine = engine or Engine(task, policy=Policy(ask_undecided=free_choice))
+    engine = engine or Engine(task)
     return _Search(engine, Names(engine, contests), shared or Shared()).run(limit)
 
 

@@ -416,9 +416,7 @@ class _PnmlReading:
             ]
             if coloured:
                 raise self.draft.fault(
-                    element,
-                    f"tokens of the colour {coloured[0]!r}",
-                    "only plain tokens are read",
+                    element, f"tokens of the colour {coloured[0]!r}", "only plain tokens are read"
                 )
             text = next((n for colour, n in pairs if colour.lower() == "default"), "0")
         return self.draft.whole(element, text or "0")

@@ -62,10 +62,7 @@ class Coverability:
 
 
 def coverability(
-    net: Net,
-    *,
-    effort: int = EFFORT,
-    bounds: Sequence[int | None] | None = None,
+    net: Net, *, effort: int = EFFORT, bounds: Sequence[int | None] | None = None
 ) -> Coverability:
     """Return the bounds of all places by the Karp-Miller tree.
 

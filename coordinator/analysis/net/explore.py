@@ -9,13 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.net.pack import (
-    Layout,
-    Rules,
-    Test,
-    TooManyTokens,
-    Words,
-)
+from petrobot.coordinator.analysis.net.pack import Layout, Rules, Test, TooManyTokens, Words
 from petrobot.coordinator.task.net import Net
 
 Numbers = NDArray[np.int32]

@@ -219,11 +219,7 @@ class NumpyEngine:
         return number, np.concatenate(new), np.concatenate(taken)
 
     def _commit(
-        self,
-        degree: NDArray[np.int64],
-        label: NDArray[np.int64],
-        target: Numbers,
-        cap: int | None,
+        self, degree: NDArray[np.int64], label: NDArray[np.int64], target: Numbers, cap: int | None
     ) -> None:
         """Append the block to the result, up to the marking whose successors reach the cap."""
         if cap is not None and self._states >= cap and len(target):

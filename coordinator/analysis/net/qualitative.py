@@ -75,10 +75,7 @@ class Qualitative:
 
 
 def examine(
-    space: Space,
-    *,
-    cover: Coverability | None = None,
-    in_haste: bool = False,
+    space: Space, *, cover: Coverability | None = None, in_haste: bool = False
 ) -> Qualitative:
     """Return all verdicts on the net of a space.
 

@@ -192,11 +192,7 @@ class Space:
 
 
 def explore(
-    net: Net,
-    *,
-    engine: EngineName = "auto",
-    limits: SearchLimits | None = None,
-    edges: bool = True,
+    net: Net, *, engine: EngineName = "auto", limits: SearchLimits | None = None, edges: bool = True
 ) -> Space:
     """Return the markings that are reachable from the initial one.
 

@@ -163,11 +163,7 @@ class Chain:
 
     @classmethod
     def of(
-        cls,
-        gspn: Gspn,
-        *,
-        space: Space | None = None,
-        limits: SearchLimits | None = None,
+        cls, gspn: Gspn, *, space: Space | None = None, limits: SearchLimits | None = None
     ) -> Chain:
         """Return the chain of a GSPN; its space is explored unless given.
 

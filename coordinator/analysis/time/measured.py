@@ -12,16 +12,7 @@ from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import NamedTuple, TypeVar
 
-from petrobot.coordinator.task import (
-    End,
-    Estimate,
-    Executed,
-    Kind,
-    Place,
-    Status,
-    Task,
-    Transition,
-)
+from petrobot.coordinator.task import End, Estimate, Executed, Kind, Place, Status, Task, Transition
 
 K = TypeVar("K", bound=Hashable)
 Ending = tuple[str, str]

@@ -295,7 +295,61 @@ def stochastic_view(
     ValueError for what a GSPN cannot express.
     """
     known = measured or Measured()
-    return _Derivation(task.flat, known, stages, timer_stages, devices or {}).result()
+    return _Derivation(task.flat, known, stages, timer_stages, devices or {}).derive()
+
+
+@dataclass
+class _Parts:
+    """The GSPN as it grows."""
+
+    places: Weights
+    arcs: dict[str, tuple[Weights, Weights]] = field(default_factory=dict)
+    inhibit: dict[str, Weights] = field(default_factory=dict)
+    priority: Weights = field(default_factory=dict)
+    rates: dict[str, float] = field(default_factory=dict)
+    weights: dict[str, float] = field(default_factory=dict)
+    servers: dict[str, int | None] = field(default_factory=dict)
+    sources: dict[str, str] = field(default_factory=dict)
+
+    def immediate(
+        self,
+        name: str,
+        need: Weights,
+        give: Weights,
+        weight: float,
+        priority: int,
+        source: str = "",
+    ) -> None:
+        """Add a transition that takes no time."""
+        self.arcs[name], self.weights[name], self.priority[name] = (need, give), weight, priority
+        if source:
+            self.sources[name] = source
+
+    def timed(
+        self,
+        name: str,
+        need: Weights,
+        give: Weights,
+        rate: float,
+        source: str,
+        servers: int | None = None,
+    ) -> None:
+        """Add a transition with an exponential time."""
+        self.arcs[name], self.rates[name], self.servers[name] = (need, give), rate, servers
+        self.sources[name] = source
+
+    def gspn(self, task: Task) -> Gspn:
+        """Return the net; the places of the task keep their capacities."""
+        capacity = zip(task.net.places, task.net.capacity, strict=True)
+        net = Net.build(
+            self.places,
+            self.arcs,
+            inhibitors=self.inhibit,
+            capacity={p: c for p, c in capacity if c is not None},
+            priority=self.priority,
+            counters=task.net.counters,
+        )
+        return Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
 
 
 class _Derivation:
@@ -315,13 +369,7 @@ class _Derivation:
         """By place in which a run is active: the place of the device that it holds."""
         self.stages, self.timer_stages = stages, timer_stages
         net = task.net
-        self.places: Weights = dict(zip(net.places, net.initial, strict=True))
-        self.arcs: dict[str, tuple[Weights, Weights]] = {}
-        self.inhibit: dict[str, Weights] = {}
-        self.priority: Weights = {}
-        self.rates: dict[str, float] = {}
-        self.weights: dict[str, float] = {}
-        self.servers: dict[str, int | None] = {}
+        self.parts = _Parts(dict(zip(net.places, net.initial, strict=True)))
         self.origin: dict[str, str] = {}
         self.spoils: set[str] = set()
         self.statuses: dict[str, tuple[str, str, Status]] = {}
@@ -330,7 +378,6 @@ class _Derivation:
         self.errors: dict[str, float] = {}
         self.begins: dict[str, tuple[str, str, str]] = {}
         self.possible: dict[str, set[Status]] = {}
-        self.sources: dict[str, str] = {}
         self.comes: dict[str, str] = {}
         self.phases: dict[str, list[str]] = {}
         self.chains: dict[str, str] = {}
@@ -376,94 +423,59 @@ class _Derivation:
             if p.kind is Kind.ACTION and self._may_hold(p.name, p.most_active + 1)
         )
         """Action places where a token may have to wait for a server."""
+        self.switched: set[str] = set()
+        """Transitions whose condition is open in some case."""
+        self.turns: Weights = {}
+        """By transition: of those that can fire at once, the highest fires first."""
+
+    def derive(self) -> StochasticView:
+        """Build everything, and return the view."""
         for device in sorted(self.contended):
-            self.places[f"device {device}"] = 0
+            self.parts.places[f"device {device}"] = 0
             self.assumptions.append(
                 f"{device}: if several runs wait for this device, each is as likely to be "
                 "the next (they are served in the order in which they came)"
             )
-        for place in task.places.values():
+        for place in self.task.places.values():
             if place.kind is Kind.ACTION:
                 self._action_place(place)
         self.switched = {
             t.name
-            for t in task.transitions.values()
+            for t in self.task.transitions.values()
             if not self.compiled[t.name].never and any(case.open_ for case in self._cases(t))
         }
-        """Transitions whose condition is open in some case."""
         self.turns = self._turns()
-        for event in task.events.values():
+        for event in self.task.events.values():
             if event.scope is Scope.EXTERNAL:
                 self._event(event)
-        for transition in task.transitions.values():
+        for transition in self.task.transitions.values():
             self._transition(transition)
+        return self._view()
 
-    def result(self) -> StochasticView:
-        """Return the finished view."""
-        capacity = {
-            p: c
-            for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
-            if c is not None
-        }
-        net = Net.build(
-            self.places,
-            self.arcs,
-            inhibitors=self.inhibit,
-            capacity=capacity,
-            priority=self.priority,
-            counters=self.task.net.counters,
-        )
-        gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
+    def _view(self) -> StochasticView:
         assumed = tuple(dict.fromkeys(self.assumptions))
         return StochasticView(
             self.task,
-            gspn,
+            self.parts.gspn(self.task),
             self.origin,
             self.statuses,
             assumed,
             self.errors,
             self.begins,
-            self.sources,
+            self.parts.sources,
             frozenset(self.spoils),
             tuple(self.doubts),
             self.comes,
             self.chains,
         )
 
-    # Transitions of the GSPN.
-
-    def _immediate(
-        self,
-        name: str,
-        need: Weights,
-        give: Weights,
-        weight: float,
-        priority: int,
-        source: str = "",
-    ) -> None:
-        self.arcs[name], self.weights[name], self.priority[name] = (need, give), weight, priority
-        if source:
-            self.sources[name] = source
-
-    def _timed(
-        self,
-        name: str,
-        need: Weights,
-        give: Weights,
-        rate: float,
-        source: str,
-        servers: int | None = None,
-    ) -> None:
-        self.arcs[name], self.rates[name], self.servers[name] = (need, give), rate, servers
-        self.sources[name] = source
-
     # Action places.
 
     def _action_place(self, place: Place) -> None:
         name = place.name
-        self.places |= {f"{name}.begin": place.tokens, f"{name}.going": place.tokens}
+        self.parts.places |= {f"{name}.begin": place.tokens, f"{name}.going": place.tokens}
         if name in self.queues:
-            self.places[f"{name}.server"] = place.most_active
+            self.parts.places[f"{name}.server"] = place.most_active
         self.possible[name], self.phases[name] = set(), []
         shared: _Shared = {}
         alternatives = self.numbers.alternatives(place)
@@ -523,9 +535,9 @@ class _Derivation:
             for kind, raised in product(self.kinds[name, status], self._sets(name)):
                 label = self._ended(name, status, kind, raised)
                 asked = dict(zip(self._asked(place, status), kind, strict=True))
-                self.places[label] = 0
+                self.parts.places[label] = 0
                 self.told[label] = {f"{name}.status": str(status), **asked}
-        self.places |= {f"{name}.raised {e}": 0 for e in self.raised[name]}
+        self.parts.places |= {f"{name}.raised {e}": 0 for e in self.raised[name]}
 
     def _sets(self, name: str) -> list[tuple[str, ...]]:
         """Return the sets of internal events that a run of the place may have raised."""
@@ -628,7 +640,9 @@ class _Derivation:
             self.values[name] = {
                 v: f"{name} = {as_literal(v)}" for v in sorted(values[name], key=repr)
             }
-            self.places |= {label: int(v == first[name]) for v, label in self.values[name].items()}
+            self.parts.places |= {
+                label: int(v == first[name]) for v, label in self.values[name].items()
+            }
 
     def _raises(self, name: str) -> None:
         """Let an active run raise each event once, after an exponential wait; what a preempted run
@@ -639,12 +653,12 @@ class _Derivation:
             source = self._wait_source(event)
             for phase in active:
                 label = f"{name}.raises {event} in {phase}"
-                self._timed(label, {phase: 1}, {phase: 1, flag: 1}, 1.0 / mean, source)
+                self.parts.timed(label, {phase: 1}, {phase: 1, flag: 1}, 1.0 / mean, source)
                 self.comes[label] = event
-                self.inhibit[label] = {flag: 1}
+                self.parts.inhibit[label] = {flag: 1}
             forget = f"{name}.forgets {event}"
-            self._immediate(forget, {flag: 1}, {}, 1.0, FLUSH - 1)
-            self.inhibit[forget] = dict.fromkeys(active, 1)
+            self.parts.immediate(forget, {flag: 1}, {}, 1.0, FLUSH - 1)
+            self.parts.inhibit[forget] = dict.fromkeys(active, 1)
 
     def _device(self, action: str) -> str:
         """Return the place of the device that a run may have to wait for; empty if it need not."""
@@ -655,11 +669,11 @@ class _Derivation:
         """Let an immediate transition wait for the device and give it to a run of the place, which
         holds it while its token is in one of `active`."""
         if device:
-            need, give = self.arcs[name]
-            self.arcs[name] = (need, {**give, device: 1})
+            need, give = self.parts.arcs[name]
+            self.parts.arcs[name] = (need, {**give, device: 1})
             self.held |= dict.fromkeys(active, device)
             if self.task.primitive_task_of(place.name).start is not Start.AT_ONCE:
-                self.inhibit[name] = {device: 1}
+                self.parts.inhibit[name] = {device: 1}
 
     def _causes(self, place: Place, actions: Iterable[str]) -> None:
         """Add preemption as a cause by which a run ends: a token in `p.by.t` means that t takes
@@ -668,7 +682,7 @@ class _Derivation:
         for t in self.task.transitions.values():
             if is_cause(t) and any(a.place == name for a in t.inputs if a.end is not None):
                 self.by[name, t.name] = f"{name}.by.{t.name}"
-                self.places[f"{name}.by.{t.name}"] = 0
+                self.parts.places[f"{name}.by.{t.name}"] = 0
                 self.phases[name].append(f"{name}.by.{t.name}")
         for action in actions:
             for transition, estimate in self.measured.preempted[name, action].items():
@@ -685,11 +699,11 @@ class _Derivation:
         for i, branch in enumerate(duration.branches):
             stem = f"{end}.{action}{'abc'[i]}"
             chain = [f"{stem}{k}" for k in range(1, branch.stages + 1)]
-            self.places |= dict.fromkeys(chain, 0)
+            self.parts.places |= dict.fromkeys(chain, 0)
             self.chains |= dict.fromkeys(chain, stem)
             self.phases[name] += chain
             self.begins[f"{key} {i + 1}"] = (key, name, action)
-            self._immediate(
+            self.parts.immediate(
                 f"{key} {i + 1}",
                 {f"{name}.{action}": 1},
                 {chain[0]: 1},
@@ -701,7 +715,7 @@ class _Derivation:
             for phase, following in zip(chain, [*chain[1:], end], strict=True):
                 source = self._source(name, action)
                 need = {phase: 1} | ({device: 1} if device and following == end else {})
-                self._timed(phase, need, {following: 1}, branch.rate, source)
+                self.parts.timed(phase, need, {following: 1}, branch.rate, source)
 
     def _source(self, place: str, action: str) -> str:
         """Return where the numbers of an action in a place come from."""
@@ -714,13 +728,15 @@ class _Derivation:
     def _choice(self, place: Place, action: str, chosen: float) -> None:
         name = place.name
         need = {f"{name}.begin": 1, **self._server(name)}
-        self.places[f"{name}.{action}"] = 0
+        self.parts.places[f"{name}.{action}"] = 0
         primitive = self.task.primitive_task_of(name)
         source = ""
         if len(primitive.alternatives) > 1:
             known = primitive.name in self.measured.choice
             source = "measured shares of the alternatives" if known else "assumed equally likely"
-        self._immediate(f"{name}.{action}", need, {f"{name}.{action}": 1}, chosen, CHOICE, source)
+        self.parts.immediate(
+            f"{name}.{action}", need, {f"{name}.{action}": 1}, chosen, CHOICE, source
+        )
 
     def _status(
         self,
@@ -748,7 +764,7 @@ class _Derivation:
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
             self.statuses[label], self.begins[label] = (name, action, status), (key, name, action)
-            self._immediate(
+            self.parts.immediate(
                 label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE, source
             )
             self._takes(label, place, device, ())
@@ -783,12 +799,14 @@ class _Derivation:
             longest = max(b.stages for b in branches)
             stem = f"{place.name}.{status}.{number}{'abc'[j]}"
             chain = [f"{stem}{i}" for i in range(1, longest + 1)]
-            self.places |= dict.fromkeys(chain, 0)
+            self.parts.places |= dict.fromkeys(chain, 0)
             self.chains |= dict.fromkeys(chain, stem)
             self.phases[place.name] += chain
             self.held |= dict.fromkeys(chain if device else (), device)
             for i in range(1, longest):
-                self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source)
+                self.parts.timed(
+                    f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate, source
+                )
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
             need |= {device: 1} if device else {}
             for (kind, part), raised in product(ends.items(), self._sets(place.name)):
@@ -797,11 +815,13 @@ class _Derivation:
                 flags = {e: f"{place.name}.raised {e}" for e in self.raised[place.name]}
                 ended = self._ended(place.name, status, kind, raised)
                 give = {ended: 1, **self._server(place.name)}
-                self._timed(label, need | {flags[e]: 1 for e in raised}, give, rate * part, source)
+                self.parts.timed(
+                    label, need | {flags[e]: 1 for e in raised}, give, rate * part, source
+                )
                 if status is not Status.SUCCESS:
                     self.spoils.add(label)
                 if others := {flags[e]: 1 for e in flags if e not in raised}:
-                    self.inhibit[label] = others
+                    self.parts.inhibit[label] = others
             entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
         return entries
 
@@ -818,15 +838,15 @@ class _Derivation:
         """Remove what is left of a preempted run at once, and release its server and device. The
         active run began first, so it goes before those that have not begun."""
         taken = f"{name}.{how}"
-        self.places[taken] = 0
+        self.parts.places[taken] = 0
         for p in self.phases[name]:
             need = {p: 1, taken: 1} | ({self.held[p]: 1} if p in self.held else {})
             label = f"flush {p}" if how == KEPT else f"flush lost {p}"
-            self._immediate(label, need, self._server(name), 1.0, FLUSH)
+            self.parts.immediate(label, need, self._server(name), 1.0, FLUSH)
             if how == LOST and p not in self.waiting:
                 self.spoils.add(label)
         begin, label = f"{name}.begin", f"flush {name}.{how} begin"
-        self._immediate(label, {begin: 1, taken: 1}, {}, 1.0, FLUSH - 1)
+        self.parts.immediate(label, {begin: 1, taken: 1}, {}, 1.0, FLUSH - 1)
 
     # External events.
 
@@ -851,14 +871,14 @@ class _Derivation:
         if not waiting or not (before or self._together(waiting)):
             return
         flag, rate = f"event {event.name}", 1.0 / self.numbers.wait(event.name)
-        self.places[flag] = 0
+        self.parts.places[flag] = 0
         source = self._wait_source(event.name)
         cases: list[Needs] = [({}, {})] if kept else list(_some_enabled(waiting))
         for i, case in enumerate(cases):
             name = f"{flag} comes" if len(cases) == 1 else f"{flag} comes {i + 1}"
-            need, self.inhibit[name] = self._named(case)
-            self.inhibit[name][flag] = 1
-            self._timed(name, need, {**need, flag: 1}, rate, source, 1)
+            need, self.parts.inhibit[name] = self._named(case)
+            self.parts.inhibit[name][flag] = 1
+            self.parts.timed(name, need, {**need, flag: 1}, rate, source, 1)
             self.comes[name] = event.name
         if kept:
             self.assumptions.append(
@@ -878,19 +898,21 @@ class _Derivation:
                 self._drop(name, flag, need, inhibit)
                 continue
             # What a firing gives cannot end the waiting, so the flag was gone before it gave.
-            self._immediate(name, {**need, flag: 1}, need, 1.0, FLUSH - 2)
-            self.inhibit[name] = inhibit
+            self.parts.immediate(name, {**need, flag: 1}, need, 1.0, FLUSH - 2)
+            self.parts.inhibit[name] = inhibit
 
     def _drop(self, name: str, what: str, need: Weights, inhibit: Weights) -> None:
         """Take a token of a place as the engine drops a timer or a latched event that may be
         barred for a moment: between taking and giving of a firing, or when nothing can fire any
         more."""
-        self.places[GIVING] = 0
+        self.parts.places[GIVING] = 0
         tests: list[tuple[str, Weights, int]]
         tests = [("", {}, REST), (f" {GIVING}", {GIVING: 1}, FLUSH - 2)]
         for when, test, priority in tests:
-            self._immediate(name + when, {**need, what: 1, **test}, {**need, **test}, 1.0, priority)
-            self.inhibit[name + when] = inhibit
+            self.parts.immediate(
+                name + when, {**need, what: 1, **test}, {**need, **test}, 1.0, priority
+            )
+            self.parts.inhibit[name + when] = inhibit
 
     def _pulse(self, flag: str, waiting: Sequence[CompiledTransition]) -> None:
         """Let a pulse serve each transition that is fireable when it comes, once."""
@@ -901,13 +923,13 @@ class _Derivation:
         for x in waiting:
             self.served[x.name] = SERVE + 1 + order.index(turns[x.name])
             called = self.called[x.name] = f"{x.name}.called"
-            self.places[called] = 0
+            self.parts.places[called] = 0
             for i, case in enumerate(self._cases(self.task.transitions[x.name])):
                 name, test = f"{called} {i + 1}", {**case.need, **case.values, flag: 1}
-                self._immediate(name, test, {**test, called: 1}, 1.0, CALL)
-                self.inhibit[name] = {**self._named(({}, dict(x.bars)))[1], called: 1}
-            self._immediate(f"{called} no more", {called: 1}, {}, 1.0, SERVE)
-        self._immediate(f"{flag} over", {flag: 1}, {}, 1.0, CALL - 1)
+                self.parts.immediate(name, test, {**test, called: 1}, 1.0, CALL)
+                self.parts.inhibit[name] = {**self._named(({}, dict(x.bars)))[1], called: 1}
+            self.parts.immediate(f"{called} no more", {called: 1}, {}, 1.0, SERVE)
+        self.parts.immediate(f"{flag} over", {flag: 1}, {}, 1.0, CALL - 1)
 
     def _together(self, waiting: Sequence[CompiledTransition]) -> bool:
         """Return whether several of the transitions may be enabled together."""
@@ -1018,7 +1040,7 @@ class _Derivation:
             name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
             self.origin[name] = t.name
             bars = self.compiled[t.name].bars
-            self.inhibit[name] = self._named(({}, dict(bars)))[1]
+            self.parts.inhibit[name] = self._named(({}, dict(bars)))[1]
             self._fires(t, name, case)
 
     def _cases(self, t: Transition) -> list[_Case]:
@@ -1120,7 +1142,7 @@ class _Derivation:
         priority = TASK + self.turns[t.name]
         need, give = case.need | case.values, self._given(t, name, case)
         if any((a.place, t.name) in self.by for a in t.inputs):
-            self._immediate(name, need, give, 1.0, priority)
+            self.parts.immediate(name, need, give, 1.0, priority)
             return
         if t.after is not None:
             if case.open_:
@@ -1132,17 +1154,19 @@ class _Derivation:
         share = self._switch(t) if measured or case.open_ else 1.0
         need |= {f"event {e}": 1 for e in t.events if e in self.flags}
         if t.name in self.called:
-            self._immediate(name, need | {self.called[t.name]: 1}, give, share, self.served[t.name])
+            self.parts.immediate(
+                name, need | {self.called[t.name]: 1}, give, share, self.served[t.name]
+            )
         elif event := self._awaited_event(t):
             rate = share / self.numbers.wait(event)
-            self._timed(name, need, give, rate, self._wait_source(event), 1)
+            self.parts.timed(name, need, give, rate, self._wait_source(event), 1)
         else:
             declared = t.weight is not None and not measured  # how often it fired contains it
             weight = t.weight if t.weight is not None and declared else share
             source = "weight declared in the task file" if declared else ""
             if measured:
                 source = "measured frequency of its condition"
-            self._immediate(name, need, give, weight, priority, source)
+            self.parts.immediate(name, need, give, weight, priority, source)
 
     def _given(self, t: Transition, name: str, case: _Case) -> Weights:
         """Return what a case gives. Where its taking alone may drop a timer or a latched event of
@@ -1150,8 +1174,8 @@ class _Derivation:
         if not self._drops(self.compiled[t.name]):
             return Counter(case.back) + Counter(case.give)
         step = f"{name} gives"
-        self.places |= {step: 0, GIVING: 0}
-        self._immediate(step, {step: 1, GIVING: 1}, case.give, 1.0, FLUSH - 3)
+        self.parts.places |= {step: 0, GIVING: 0}
+        self.parts.immediate(step, {step: 1, GIVING: 1}, case.give, 1.0, FLUSH - 3)
         return {**case.back, step: 1, GIVING: 1}
 
     def _drops(self, fired: CompiledTransition) -> bool:
@@ -1205,18 +1229,18 @@ class _Derivation:
         source = f"declared: after {t.after:g} s"
         counted = need | ({count: ticks} if ticks else {})
         if case.values:
-            self._immediate(name, counted | case.values, give, 1.0, priority)
+            self.parts.immediate(name, counted | case.values, give, 1.0, priority)
         else:
-            self._timed(name, counted, give, branch.rate, source, 1)
+            self.parts.timed(name, counted, give, branch.rate, source, 1)
         if not ticks or stem != name:  # values of variables do not concern the timer
             return
-        self.places[count] = 0
-        self._timed(tick, need, {**need, count: 1}, branch.rate, source, 1)
+        self.parts.places[count] = 0
+        self.parts.timed(tick, need, {**need, count: 1}, branch.rate, source, 1)
         bars = self.compiled[t.name].bars
         barred = self._named(({}, dict(bars)))[1]
-        self.inhibit[tick] = barred | {count: ticks}
+        self.parts.inhibit[tick] = barred | {count: ticks}
         for place, n in need.items():
-            self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)
-            self.inhibit[f"{name}.reset {place}"] = {place: n}
+            self.parts.immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)
+            self.parts.inhibit[f"{name}.reset {place}"] = {place: n}
         for place, n in barred.items():
             self._drop(f"{name}.barred {place}", count, {place: n}, {})

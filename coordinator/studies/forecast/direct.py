@@ -147,9 +147,7 @@ def mean_figure(
         few = student(n - 1)
         return time_figure(centre, centre + both * few.ppf(levels), centre + alone * few.ppf(_BOTH))
     return time_figure(
-        centre,
-        centre + both * _quantiles(fresh, levels),
-        centre + alone * _quantiles(truth, _BOTH),
+        centre, centre + both * _quantiles(fresh, levels), centre + alone * _quantiles(truth, _BOTH)
     )
 
 

@@ -39,10 +39,9 @@ from petrobot.coordinator.studies.forecast.history import (
     Values,
     Waits,
     as_arrays,
-    at_deadline,
-    changed,
     ended_within,
 )
+from petrobot.coordinator.studies.forecast.whatif import at_deadline, changed
 
 ALPHA = 0.01
 """Significance level of a split, over all factors of a node (Bonferroni)."""

@@ -134,11 +134,7 @@ class Structure:
         return cls(flat, vocabulary, moves, initial, flat.net.compiled, codes, assumptions, first)
 
 
-def _move(
-    flat: Task,
-    t: Transition,
-    compiled: CompiledTransition,
-) -> Move:
+def _move(flat: Task, t: Transition, compiled: CompiledTransition) -> Move:
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
     ends = [a.name for a in compiled.actions if a.end in (End.NORMAL, End.ERROR)]

@@ -16,11 +16,12 @@ come, first served.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.pack import concession
 from petrobot.coordinator.analysis.time.measured import branching_places
@@ -28,25 +29,13 @@ from petrobot.coordinator.engine.compiled import contested_places
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
-from petrobot.coordinator.task import (
-    Counts,
-    EarlyEvent,
-    End,
-    EventMemory,
-    Start,
-    Status,
-    Task,
-)
+from petrobot.coordinator.task import Counts, EarlyEvent, End, EventMemory, Start, Status, Task
 from petrobot.coordinator.task.compiled_task import ActionArc
 from petrobot.coordinator.task.conditions import ConditionFault, Expression
+from petrobot.coordinator.task.conditions.language import Scalar
 from petrobot.coordinator.task.net import Marking
 
 IDLE, QUEUED, GOING, DONE = range(4)
-_BY_RUN = (
-    "_phase", "_status", "_want", "_preempted", "_end", "_action", "_outcome", "_took", "_came",
-    "_beyond", "_device", "_turn", "_entered", "_ended",
-)  # fmt: skip
-"""Arrays with a row for each run."""
 Row: TypeAlias = int | Codes
 Columns: TypeAlias = slice | Codes
 ALL = slice(None)
@@ -85,22 +74,185 @@ class Played:
     """By action place: how often each transition took a token out of it."""
 
 
-def _shared(moves: Sequence[Move], task: Task, drawer: Drawer) -> dict[str, list[int]]:
-    """Return the numbers of moves that wait for an event or a timer, by their clock: its own, or
-    that of a latched event of which the rate is known. The first of them that can fire consumes
-    it."""
-    clocks: dict[str, list[int]] = {}
-    for i, m in enumerate(moves):
-        own = f" {i}"  # not the name of an event
-        key = task.transitions[m.name].events[0] if _is_latched(m, drawer) else own
-        clocks.setdefault(key, []).append(i)
-    return clocks
+@dataclass
+class _Runs:
+    """The runs of all columns. Arrays (rows, columns)."""
+
+    phase: NDArray[np.int8]
+    status: Codes
+    want: Codes
+    """Number of the transition that took the measured run; -1 for any."""
+    preempted: Mask
+    end: Values
+    """When it will end; inf if it is not active."""
+    action: Codes
+    outcome: Codes
+    took: Values
+    came: Values
+    """When it began to wait for its device, or began."""
+    beyond: Mask
+    """Whether it lasts longer than any that was seen."""
+    device: Codes
+    """-1 for none."""
+    turn: Codes
+    """Its number among those that wait for a device; 0 if it does not."""
+    entered: Codes
+    """Its number among those that came."""
+    ended: Codes
+    """Its number among those that ended."""
+
+    @classmethod
+    def idle(cls, rows: int, n: int) -> _Runs:
+        """Return rows without runs."""
+        blank: dict[str, Any] = {"phase": np.int8(IDLE), "want": -1, "device": -1, "end": np.inf}
+        blank |= {"took": 0.0, "came": 0.0, "preempted": False, "beyond": False}
+        return cls(**{f.name: np.full((rows, n), blank.get(f.name, 0)) for f in fields(cls)})
+
+    def keep(self, kept: Mask) -> None:
+        """Continue with some columns."""
+        for f in fields(self):
+            setattr(self, f.name, getattr(self, f.name)[:, kept])
+
+    def add_row(self) -> None:
+        """Make room for one more run."""
+        more = self.idle(1, self.phase.shape[1])
+        for f in fields(self):
+            setattr(self, f.name, np.concatenate([getattr(self, f.name), getattr(more, f.name)]))
 
 
-def _is_latched(m: Move, drawer: Drawer) -> bool:
-    """Return whether the move waits for a latched event of which the rate is known."""
-    latched = m.memory is not None and m.memory[0] is EventMemory.LATCHED
-    return latched and not drawer.as_measured(m.name)
+class _Variables:
+    """Values of the variables that follow from what fired."""
+
+    def __init__(self, first: Mapping[str, Scalar | None], n: int) -> None:
+        self.valuations = [first]
+        self.valuation = np.zeros(n, np.int64)
+        """By column: the index of its valuation."""
+
+    def keep(self, kept: Mask) -> None:
+        """Continue with some columns."""
+        self.valuation = self.valuation[kept]
+
+    def satisfy(self, condition: Expression) -> Mask:
+        """Return where a condition on them is true."""
+        codes, where = np.unique(self.valuation, return_inverse=True)
+        held = []
+        for code in codes.tolist():
+            try:
+                held.append(condition.holds(self.valuations[code]))
+            except ConditionFault:
+                held.append(False)
+        return np.array(held, np.bool_)[where]
+
+    def write(self, m: Move, columns: Codes) -> None:
+        """Set what the transition sets."""
+        written = self.valuation[columns]
+        for code in np.unique(written).tolist():
+            before = self.valuations[code]
+            after = {
+                **before,
+                **{name: v.value(before) for name, v in m.transition.sets if name in before},
+            }
+            if after not in self.valuations:
+                self.valuations.append(after)
+            own = columns[written == code]
+            self.valuation[own] = self.valuations.index(after)
+
+
+class _Clocks:
+    """When the events and timers come for which transitions wait. Transitions that wait for the
+    same latched event, of which the rate is known, share a clock: the first of them that can fire
+    consumes it."""
+
+    def __init__(
+        self,
+        moves: Sequence[Move],
+        structure: Structure,
+        drawer: Drawer,
+        periods: Mapping[str, float],
+        n: int,
+    ) -> None:
+        self._s, self._drawer, self._periods = structure, drawer, periods
+        self.moves = [m for m in moves if m.waits and not m.cause]
+        shared = [self._is_latched(m) for m in self.moves]
+        clocks: dict[str | int, list[int]] = {}
+        for i, m in enumerate(self.moves):
+            key = structure.task.transitions[m.name].events[0] if shared[i] else i
+            clocks.setdefault(key, []).append(i)
+        self.members = list(clocks.values())
+        """By clock: the indices of its transitions in `moves`."""
+        self.latched = {
+            self.moves[i].number: clock
+            for clock, members in enumerate(self.members)
+            for i in members
+            if shared[i]
+        }
+        """By transition: the clock of its latched event."""
+        self.due = np.full((len(self.members), n), np.inf)
+        self._pulses = {event: drawer.chance(n) * s for event, s in periods.items()}
+        """By event of a timer: when it comes for the first time. A trial may begin at any time."""
+
+    def _is_latched(self, m: Move) -> bool:
+        latched = m.memory is not None and m.memory[0] is EventMemory.LATCHED
+        return latched and not self._drawer.as_measured(m.name)
+
+    def keep(self, kept: Mask) -> None:
+        """Continue with some columns."""
+        self.due = self.due[:, kept]
+        self._pulses = {event: first[kept] for event, first in self._pulses.items()}
+
+    def wait(self, able: Sequence[Mask], now: Values, tokens: Codes, replicate: Codes) -> Values:
+        """Draw when events will come, as soon as they can serve a transition, and forget it when
+        they cannot any more. Return when each of the transitions, of which these are `able`, will
+        fire, if nothing happens before."""
+        fires = np.full((len(self.moves), len(now)), np.inf)
+        for due, members in zip(self.due, self.members, strict=True):
+            served = np.any([self._served(self.moves[i], able[i], tokens) for i in members], axis=0)
+            fresh = np.flatnonzero(served & np.isinf(due))
+            if len(fresh):
+                moves = [self.moves[i] for i in members]
+                due[fresh] = now[fresh] + self._drawn(moves, fresh, now, replicate)
+            due[~served] = np.inf
+            free = np.ones(len(now), np.bool_)  # the event serves one of them
+            for i in sorted(members, key=lambda i: -self.moves[i].priority):
+                first = able[i] & free
+                fires[i, first] = np.maximum(due[first], now[first])
+                free &= ~first
+        return fires
+
+    def _served(self, move: Move, able: Mask, tokens: Codes) -> Mask:
+        """Return where its event serves a transition if it comes now: as in the engine, a latched
+        one may come before the runs have ended that the transition takes, and a kept one at any
+        time."""
+        if move.memory is None or self._drawer.as_measured(move.name):
+            return able
+        memory, early = move.memory
+        if early is EarlyEvent.KEEP:
+            return np.ones_like(able)
+        if memory is EventMemory.LATCHED:
+            return concession(self._s.rule, tokens, move.number)
+        return able
+
+    def _drawn(
+        self, moves: Sequence[Move], columns: Codes, now: Values, replicate: Codes
+    ) -> Values:
+        move = moves[0]
+        event = next(iter(self._s.task.transitions[move.name].events), "")
+        if (
+            move.memory is not None
+            and event in self._periods
+            and not self._drawer.as_measured(move.name)
+        ):
+            period = self._periods[event]
+            wait = (self._pulses[event][columns] - now[columns]) % period
+            return np.where(wait > ROUNDING, wait, wait + period)  # one that comes now has served
+        drawn = self._drawer.wait([m.name for m in moves], replicate[columns])
+        if drawn is not None:
+            return drawn
+        if move.transition.after is not None:
+            return np.full(len(columns), move.transition.after)
+        if move.mean_wait is None:
+            return np.full(len(columns), 1e12)  # its event was never seen to come
+        return -move.mean_wait * np.log1p(-self._drawer.chance(len(columns)))
 
 
 class _Fork:
@@ -109,6 +261,7 @@ class _Fork:
 
     def __init__(self, moves: Sequence[Move], drawer: Drawer, n: int) -> None:
         self.moves, self._drawer = moves, drawer
+        self._way = {m.number: i for i, m in enumerate(moves)}
         self._shares = drawer.branches([m.name for m in moves])
         self.chosen, self._last = np.full((2, n), -1)
         self._count = np.zeros(n, np.int64)
@@ -120,8 +273,10 @@ class _Fork:
         self._count = self._count[kept]
 
     def fired(self, number: int, columns: Codes) -> None:
-        """Note which one fired."""
-        self.chosen[columns], self._last[columns] = -1, number
+        """Note that a transition fired, if it is one of the alternatives."""
+        if number not in self._way:
+            return
+        self.chosen[columns], self._last[columns] = -1, self._way[number]
         self._count[columns] += 1
 
     def choose(self, able: Mask, replicate: Codes) -> Codes:
@@ -152,6 +307,19 @@ class _Fork:
         return guessed
 
 
+def _alternatives(task: Task, moves: Sequence[Move]) -> list[list[Move]]:
+    """Return the groups of transitions that take tokens from the same places, where the
+    condition of one is open."""
+    groups = list[tuple[set[Any], list[Move]]]()
+    for m in moves:
+        places, members = branching_places(task, task.transitions[m.name]), [m]
+        for group in [g for g in groups if g[0] & places]:
+            groups.remove(group)
+            places, members = places | group[0], [*group[1], *members]
+        groups.append((places, members))
+    return [members for _, members in groups if any(m.open_ and not m.waits for m in members)]
+
+
 class Play:
     """Active trials; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
@@ -168,24 +336,18 @@ class Play:
         """`longest`: steps (ends of runs and of waits) of a trial at most. `devices`: by action the
         device for which its runs may have to wait. `periods`: by event that of its timer (s).
         Raises ValueError for a choice without probabilities."""
+        n, places, task = len(replicate), structure.vocabulary.places, structure.task
+        self._s, self._drawer, self._replicate = structure, drawer, replicate
         self._longest = longest
-        self._s, self._drawer = structure, drawer
-        n, places = len(replicate), structure.vocabulary.places
         self._choices = [self._choice(choices, name) for name in places]
         unknown = {p for p, q in structure.codes.items() if not len(self._choices[q][0])}
         self._barred, free = list[Move](), list[Move]()
         for m in structure.moves:
             starts = {p for p, _, is_action in m.transition.produce if is_action}
             (self._barred if starts & unknown else free).append(m)
-        self._slow = [m for m in free if m.waits and not m.cause]
-        self._clocks = list(_shared(self._slow, structure.task, drawer).values())
-        """Numbers in `_slow` of transitions that wait for the same coming of an event."""
-        latched = {
-            self._slow[i].number: clock
-            for clock, members in enumerate(self._clocks)
-            for i in members
-            if _is_latched(self._slow[i], drawer)
-        }
+        self._forks = [_Fork(members, drawer, n) for members in _alternatives(task, free)]
+        self._clocks = _Clocks(free, structure, drawer, periods or {}, n)
+        latched = self._clocks.latched
         self._quick = [m for m in free if not m.waits or m.number in latched]
         """Transitions that fire without time: those that wait for nothing, and those whose event
         has come before."""
@@ -199,14 +361,6 @@ class Play:
             and (m.allowed is not None or m.known is not None or m.transition.when is None)
         ]
         """Transitions that take an ended run and surely fire as soon as the marking allows it."""
-        self._forks = [_Fork(members, drawer, n) for members in self._alternatives(free)]
-        self._fork_of = {
-            m.number: (fork, i) for fork in self._forks for i, m in enumerate(fork.moves)
-        }
-        """By transition: where it is an alternative, and as which one."""
-        self._valuations = [self._s.first_values]
-        self._valuation = np.zeros(n, np.int64)
-        """By column: the index of the values of its known variables."""
         contested = contested_places([m.transition for m in structure.moves])
         self._contests = [
             (i, place, weight)
@@ -217,51 +371,31 @@ class Play:
         ]
         """Transitions (indices in `_quick`) that compete for tokens; of which place; how many."""
         self._since, self._steps = np.full((len(self._contests), n), _NEVER), 0
-        self._column = np.arange(n)
-        self._replicate = replicate
+        self._variables = _Variables(structure.first_values, n)
         self._tokens = np.repeat(structure.initial[:, None], n, axis=1)
         self._place = np.arange(len(places))
         """By row: the code of its place."""
         self._rows = [[q] for q in range(len(places))]
         """By place: its rows."""
-        self._phase = np.zeros((len(places), n), np.int8)
-        self._status, self._want = (
-            np.zeros_like(self._phase, np.int64),
-            np.full(self._phase.shape, -1),
-        )
-        self._came, self._end = np.zeros(self._phase.shape), np.full(self._phase.shape, np.inf)
-        self._preempted, self._beyond = np.zeros((2, *self._phase.shape), np.bool_)
-        self._action, self._outcome = np.zeros((2, *self._phase.shape), np.int64)
-        self._took = np.zeros(self._phase.shape)
-        self._entered, self._ended = np.zeros((2, *self._phase.shape), np.int64)
-        """By run: its number among those that came, and among those that ended."""
-        self._entries = self._ends_so_far = 0
-        self._due = np.full((len(self._clocks), n), np.inf)
-        self._periods = periods or {}
-        self._pulses = {event: self._drawer.chance(n) * s for event, s in self._periods.items()}
-        """By event of a timer: when it comes for the first time. A trial may begin at any time."""
-        self._odd: dict[str, dict[str, set[int]]] = {}
-        self._ways: dict[str, dict[str, int]] = {}
-        names, actions = sorted(set((devices or {}).values())), structure.vocabulary.actions
-        self._device_of = np.array(
-            [-1, *(names.index(devices[a]) if devices and a in devices else -1 for a in actions)]
-        )
+        self._runs = _Runs.idle(len(places), n)
+        self._entries = self._ends_so_far = self._turns = 0
+        self._seen = Seen.nothing(len(places), n)
+        of, names = devices or {}, sorted(set((devices or {}).values()))
+        known = [names.index(of[a]) if a in of else -1 for a in structure.vocabulary.actions]
+        self._device_of = np.array([-1, *known])
         """By code of an action: its device; -1 for none."""
         self._devices = range(len(names))
-        self._servers = [structure.task.places[p].most_active for p in places]
-        self._at_once = np.array(
-            [structure.task.primitive_task_of(p).start is Start.AT_ONCE for p in places]
-        )
-        self._awaited = np.array([not structure.task.places[p].listen for p in places])
-        self._device, self._turn = np.full_like(self._want, -1), np.zeros_like(self._want)
-        """By run: its device, and its number among those that wait for one; 0 if it does not."""
-        self._turns = 0
-        self._seen = Seen.nothing(len(places), n)
+        self._servers = [task.places[p].most_active for p in places]
+        self._at_once = np.array([task.primitive_task_of(p).start is Start.AT_ONCE for p in places])
+        self._awaited = np.array([not task.places[p].listen for p in places])
+        self._column = np.arange(n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._taken = np.zeros(n, np.bool_)
         """Whether the run token was taken. A trial takes it once: given back, it ends the trial."""
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
         self._ends: dict[Marking, int] = {}
+        self._odd: dict[str, dict[str, set[int]]] = {}
+        self._ways: dict[str, dict[str, int]] = {}
         self._out = Played(
             np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.full(n, np.nan)
         )
@@ -286,7 +420,9 @@ class Play:
             for q in range(len(self._rows)):
                 self._admit(q, np.arange(len(self._column)))
             self._grant()
-            self._advance(self._wait())
+            able = [self._enabled(m) for m in self._clocks.moves]
+            due = self._clocks.wait(able, self._now, self._tokens, self._replicate)
+            self._advance(due)
         odd: dict[str, Any] = {
             kind: {name: len(columns) for name, columns in by_name.items()}
             for kind, by_name in self._odd.items()
@@ -302,7 +438,7 @@ class Play:
             able = np.array([self._enabled(m) for m in self._quick])
             for i, clock in enumerate(self._latched):
                 if clock is not None:
-                    able[i] &= self._due[clock] <= self._now
+                    able[i] &= self._clocks.due[clock] <= self._now
             self._choose_ways(able)
             some: Mask = np.asarray(able.any(axis=0))
             if not some.any():
@@ -317,25 +453,13 @@ class Play:
                 columns = np.flatnonzero(chosen == i)
                 if len(columns):
                     if (clock := self._latched[i]) is not None:
-                        self._due[clock, columns] = np.inf
+                        self._clocks.due[clock, columns] = np.inf
                     self._fire(move, columns)
                     pending[i, columns] = False
         raise ValueError(
             f"{self._s.task.name}: transitions fire for ever without time going on; run "
             "petrobot check"
         )
-
-    def _alternatives(self, moves: Sequence[Move]) -> list[list[Move]]:
-        """Return the groups of transitions that take tokens from the same places, where the
-        condition of one is open."""
-        task, groups = self._s.task, list[tuple[set[Any], list[Move]]]()
-        for m in moves:
-            places, members = branching_places(task, task.transitions[m.name]), [m]
-            for group in [g for g in groups if g[0] & places]:
-                groups.remove(group)
-                places, members = places | group[0], [*group[1], *members]
-            groups.append((places, members))
-        return [members for _, members in groups if any(m.open_ and not m.waits for m in members)]
 
     def _choose_ways(self, able: Mask) -> None:
         """Leave only the chosen one of alternatives able. One that waits may be chosen, too: then
@@ -357,45 +481,21 @@ class Play:
                 if i is not None and not fork.moves[k].waits:
                     able[i] &= (fork.chosen == k) | (fork.chosen < 0)
 
-    def _holds(self, condition: Expression) -> Mask:
-        """Return where a condition on known variables is true."""
-        codes, where = np.unique(self._valuation, return_inverse=True)
-        held = []
-        for code in codes.tolist():
-            try:
-                held.append(condition.holds(self._valuations[code]))
-            except ConditionFault:
-                held.append(False)
-        return np.array(held, np.bool_)[where]
-
-    def _set(self, m: Move, columns: Codes) -> None:
-        """Write known variables."""
-        written = self._valuation[columns]
-        for code in np.unique(written).tolist():
-            before = self._valuations[code]
-            after = before | {
-                name: value.value(before) for name, value in m.transition.sets if name in before
-            }
-            if after not in self._valuations:
-                self._valuations.append(after)
-            own = columns[written == code]
-            self._valuation[own] = self._valuations.index(after)
-
     def _release(self) -> bool:
         """Let ended runs leave by a transition that surely fires in the engine, where their
         measured one is not enabled. The measured one may belong to another marking, such as another
         number of used tries. Return whether any run may leave now."""
-        held = (self._want >= 0) & (self._phase == DONE)
+        held = (self._runs.want >= 0) & (self._runs.phase == DONE)
         if not held.any():
             return False
-        measured, released = self._want, np.zeros_like(held)
-        self._want = np.where(held, -1, measured)
+        measured, released = self._runs.want, np.zeros_like(held)
+        self._runs.want = np.where(held, -1, measured)
         for m in self._certain:
             able = self._enabled(m)
             for arc in m.ended:
                 for r in self._runs_of(arc):
                     released[r] |= able & self._fits(m, arc, r)
-        self._want = np.where(released, -1, measured)
+        self._runs.want = np.where(released, -1, measured)
         return bool((held & released).any())
 
     def _first(self, able: Mask) -> Codes:
@@ -433,7 +533,7 @@ class Play:
             fitting = [self._fits(m, arc, r) for r in self._runs_of(arc)]
             out &= sum(fitting[1:], fitting[0].astype(np.int64)) >= arc.weight
         if m.known is not None:
-            out &= self._holds(m.known)
+            out &= self._variables.satisfy(m.known)
         if m.allowed is not None:
             runs = product(*(self._runs_of(arc) for arc in m.ended))
             out &= np.any([self._admits(m, m.allowed, those) for those in runs], axis=0)
@@ -444,21 +544,21 @@ class Play:
 
     def _fits(self, m: Move, arc: ActionArc, run: Row, columns: Columns = ALL) -> Mask:
         """Return where the arc may take the run."""
-        phase = self._phase[run, columns]
+        phase = self._runs.phase[run, columns]
         if arc.end is End.GOING or arc.end is End.PREEMPT:
             active: Mask = (phase == QUEUED) | (phase == GOING)
             return active | (phase == DONE) if arc.takes_done else active
-        error = self._status[run, columns] == ERROR
-        want = self._want[run, columns]
+        error = self._runs.status[run, columns] == ERROR
+        want = self._runs.want[run, columns]
         fits: Mask = (phase == DONE) & (error == (arc.end is End.ERROR))
         fits &= (want < 0) | (want == m.number)
         return fits
 
     def _admits(self, m: Move, allowed: Mask, runs: Sequence[Row], columns: Columns = ALL) -> Mask:
         """Return where the condition admits these ended runs, one for each arc that takes any."""
-        out: Mask = allowed[tuple(np.clip(self._status[r, columns], 0, None) for r in runs)]
+        out: Mask = allowed[tuple(np.clip(self._runs.status[r, columns], 0, None) for r in runs)]
         # a run whose measured transition is known shows that the condition held
-        out = out | np.any([self._want[r, columns] == m.number for r in runs], axis=0)
+        out = out | np.any([self._runs.want[r, columns] == m.number for r in runs], axis=0)
         for arc, r in zip(m.ended, runs, strict=True):
             out = out & self._fits(m, arc, r, columns)
         return out
@@ -471,7 +571,7 @@ class Play:
         for arc in arcs:
             rows = np.array(self._runs_of(arc))
             fits = np.array([self._fits(m, arc, r, columns) for r in rows])
-            numbers = self._ended if arc in m.ended else self._entered
+            numbers = self._runs.ended if arc in m.ended else self._runs.entered
             order = np.where(fits, numbers[rows][:, columns], _NEVER)
             order[rows == cut] = -1
             ranked.append(rows[order.argsort(axis=0, kind="stable")])
@@ -501,18 +601,17 @@ class Play:
             if arc.end is End.PREEMPT and not m.cause:
                 for row in rows:
                     self._cut(m, arc.counts, row, columns)
-            self._phase[rows, columns], self._end[rows, columns] = IDLE, np.inf
-            self._device[rows, columns], self._turn[rows, columns] = -1, 0
+            self._runs.phase[rows, columns], self._runs.end[rows, columns] = IDLE, np.inf
+            self._runs.device[rows, columns], self._runs.turn[rows, columns] = -1, 0
             ways = self._ways.setdefault(arc.name, {})
             ways[m.name] = ways.get(m.name, 0) + rows.size
         if m.takes_run:
             self._begun[columns], self._taken[columns] = self._now[columns], True
         self._goals[columns] += m.is_goal
-        if m.number in self._fork_of:
-            fork, i = self._fork_of[m.number]
-            fork.fired(i, columns)
+        for fork in self._forks:
+            fork.fired(m.number, columns)
         if m.transition.sets:
-            self._set(m, columns)
+            self._variables.write(m, columns)
         for place, weight, is_action in m.transition.produce:
             if is_action:
                 taken.append(self._s.codes[place])
@@ -525,30 +624,26 @@ class Play:
         """Put a run into the queue of its place, in the first row that is free."""
         self._entries += 1
         for r in self._rows[q]:
-            free = self._phase[r, columns] == IDLE
+            free = self._runs.phase[r, columns] == IDLE
             self._queue(r, columns[free])
             columns = columns[~free]
         if len(columns):
             self._rows[q].append(len(self._place))
             self._place = np.append(self._place, q)
-            for name in _BY_RUN:
-                own: np.ndarray = getattr(self, name)
-                setattr(self, name, np.concatenate([own, own[:1]]))
-            self._phase[-1], self._end[-1], self._want[-1] = IDLE, np.inf, -1
-            self._device[-1], self._turn[-1] = -1, 0
+            self._runs.add_row()
             self._queue(self._rows[q][-1], columns)
 
     def _queue(self, run: int, columns: Codes) -> None:
-        self._phase[run, columns], self._entered[run, columns] = QUEUED, self._entries
+        self._runs.phase[run, columns], self._runs.entered[run, columns] = QUEUED, self._entries
 
     def _admit(self, q: int, columns: Codes) -> None:
         """Begin runs while a server is free; further tokens wait."""
         rows = self._rows[q]
         while len(columns):
-            phase = self._phase[rows][:, columns]
+            phase = self._runs.phase[rows][:, columns]
             free = (phase == GOING).sum(axis=0) < self._servers[q]
             columns, phase = columns[free], phase[:, free]
-            waiting = np.where(phase == QUEUED, self._entered[rows][:, columns], _NEVER)
+            waiting = np.where(phase == QUEUED, self._runs.entered[rows][:, columns], _NEVER)
             fresh = waiting.min(axis=0) < _NEVER
             columns, first = columns[fresh], waiting[:, fresh].argmin(axis=0)
             for i in np.unique(first):
@@ -558,27 +653,27 @@ class Play:
         """Let runs begin whose device is free, in the order in which their tokens came."""
         never = np.iinfo(np.int64).max
         for device in self._devices:
-            mine, columns = self._device == device, np.arange(len(self._column))
-            busy = (mine & (self._turn == 0) & (self._phase == GOING)).any(axis=0)
-            turn = np.where(mine & (self._turn > 0), self._turn, never)
+            mine, columns = self._runs.device == device, np.arange(len(self._column))
+            busy = (mine & (self._runs.turn == 0) & (self._runs.phase == GOING)).any(axis=0)
+            turn = np.where(mine & (self._runs.turn > 0), self._runs.turn, never)
             while (turn < never).any():
                 q = turn.argmin(axis=0)
                 begins = (turn[q, columns] < never) & (self._at_once[self._place[q]] | ~busy)
                 own, its = columns[begins], q[begins]
-                self._turn[its, own], self._came[its, own] = 0, self._now[own]
-                self._end[its, own] = self._now[own] + self._took[its, own]
+                self._runs.turn[its, own], self._runs.came[its, own] = 0, self._now[own]
+                self._runs.end[its, own] = self._now[own] + self._runs.took[its, own]
                 busy |= begins
                 turn[q, columns] = never
 
     def _cut(self, m: Move, counts: Counts, rows: Codes, columns: Codes) -> None:
         """End runs that are taken while they are active: they count as the arc says. One that still
         waits for a server or its device never began, so it does not count."""
-        active = (self._phase[rows, columns] == GOING) & (self._turn[rows, columns] == 0)
+        active = (self._runs.phase[rows, columns] == GOING) & (self._runs.turn[rows, columns] == 0)
         rows, columns = rows[active], columns[active]
         status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
-        lasted = self._now[columns] - self._came[rows, columns]
+        lasted = self._now[columns] - self._runs.came[rows, columns]
         code = np.full(len(columns), self._s.vocabulary.outcome(status, m.number))
-        self._seen.note(self._place[rows], columns, code, self._action[rows, columns], lasted)
+        self._seen.note(self._place[rows], columns, code, self._runs.action[rows, columns], lasted)
         self._good[columns] &= status <= SUCCESS
 
     def _note_odd(self, kind: str, name: str, columns: Codes) -> None:
@@ -600,112 +695,60 @@ class Play:
         ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
         self._seen.begun[q, columns] = action
         status, taken = self._s.vocabulary.parts(ends.outcome)
-        now = self._now[columns]
-        self._phase[run, columns] = GOING
-        self._status[run, columns], self._want[run, columns] = status, taken
-        self._preempted[run, columns], self._outcome[run, columns] = ends.preempted, ends.outcome
-        self._came[run, columns], self._end[run, columns] = now, now + ends.took
-        self._action[run, columns], self._took[run, columns] = action, ends.took
-        self._beyond[run, columns] = ends.beyond
+        runs, now = self._runs, self._now[columns]
+        runs.phase[run, columns] = GOING
+        runs.status[run, columns], runs.want[run, columns] = status, taken
+        runs.preempted[run, columns], runs.outcome[run, columns] = ends.preempted, ends.outcome
+        runs.came[run, columns], runs.end[run, columns] = now, now + ends.took
+        runs.action[run, columns], runs.took[run, columns] = action, ends.took
+        runs.beyond[run, columns] = ends.beyond
         device = self._device_of[action]
-        self._device[run, columns], self._turn[run, columns] = device, 0
+        runs.device[run, columns], runs.turn[run, columns] = device, 0
         waits = columns[device >= 0]
         if len(waits):
             self._turns += 1
-            self._turn[run, waits], self._end[run, waits] = self._turns, np.inf
-
-    def _wait(self) -> Values:
-        """Draw when the events of transitions that wait will come, as soon as they can serve them,
-        and forget it when they cannot any more. Return when each transition will fire, if nothing
-        happens before."""
-        fires = np.full((len(self._slow), len(self._column)), np.inf)
-        for due, members in zip(self._due, self._clocks, strict=True):
-            moves = [self._slow[i] for i in members]
-            able = [self._enabled(move) for move in moves]
-            served = np.any([self._served(m, a) for m, a in zip(moves, able, strict=True)], axis=0)
-            fresh = np.flatnonzero(served & np.isinf(due))
-            if len(fresh):
-                due[fresh] = self._now[fresh] + self._drawn_wait(moves, fresh)
-            due[~served] = np.inf
-            free = np.ones(len(self._column), np.bool_)  # the event serves one of them
-            for k in sorted(range(len(moves)), key=lambda k: -moves[k].priority):
-                first = able[k] & free
-                fires[members[k], first] = np.maximum(due[first], self._now[first])
-                free &= ~first
-        return fires
-
-    def _served(self, move: Move, able: Mask) -> Mask:
-        """Return where its event serves a transition if it comes now: as in the engine, a latched
-        one may come before the runs have ended that the transition takes, and a kept one at any
-        time."""
-        if move.memory is None or self._drawer.as_measured(move.name):
-            return able
-        memory, early = move.memory
-        if early is EarlyEvent.KEEP:
-            return np.ones_like(able)
-        if memory is EventMemory.LATCHED:
-            return concession(self._s.rule, self._tokens, move.number)
-        return able
-
-    def _drawn_wait(self, moves: Sequence[Move], columns: Codes) -> Values:
-        move = moves[0]
-        event = next(iter(self._s.task.transitions[move.name].events), "")
-        if (
-            move.memory is not None
-            and event in self._periods
-            and not self._drawer.as_measured(move.name)
-        ):
-            period = self._periods[event]
-            wait = (self._pulses[event][columns] - self._now[columns]) % period
-            return np.where(wait > ROUNDING, wait, wait + period)  # one that comes now has served
-        drawn = self._drawer.wait([m.name for m in moves], self._replicate[columns])
-        if drawn is not None:
-            return drawn
-        if move.transition.after is not None:
-            return np.full(len(columns), move.transition.after)
-        if move.mean_wait is None:
-            return np.full(len(columns), 1e12)  # its event was never seen to come
-        return -move.mean_wait * np.log1p(-self._drawer.chance(len(columns)))
+            runs.turn[run, waits], runs.end[run, waits] = self._turns, np.inf
 
     def _advance(self, due: Values) -> None:
         """On to the next end of a run or of a wait in each column."""
-        run = self._end.argmin(axis=0)
-        ends = self._end[run, np.arange(len(run))]
-        i = due.argmin(axis=0) if len(self._slow) else np.zeros(len(run), np.int64)
-        dues = due[i, np.arange(len(run))] if len(self._slow) else np.full(len(run), np.inf)
+        run = self._runs.end.argmin(axis=0)
+        ends = self._runs.end[run, np.arange(len(run))]
+        i = due.argmin(axis=0) if len(due) else np.zeros(len(run), np.int64)
+        dues = due[i, np.arange(len(run))] if len(due) else np.full(len(run), np.inf)
         soonest = np.minimum(ends, dues)
         moving = np.isfinite(soonest)
         self._now = np.where(moving, soonest, self._now)
-        for number in range(len(self._end)):
+        for number in range(len(self._runs.end)):
             self._end_runs(number, np.flatnonzero(moving & (ends <= dues) & (run == number)))
-        for clock, number in ((c, i) for c, members in enumerate(self._clocks) for i in members):
-            columns = np.flatnonzero(moving & (dues < ends) & (i == number))
-            if len(columns):
-                self._due[clock, columns] = np.inf
-                self._fire(self._slow[number], columns)
+        for clock, members in enumerate(self._clocks.members):
+            for number in members:
+                columns = np.flatnonzero(moving & (dues < ends) & (i == number))
+                if len(columns):
+                    self._clocks.due[clock, columns] = np.inf
+                    self._fire(self._clocks.moves[number], columns)
         self._free(np.flatnonzero(~moving))
 
     def _end_runs(self, run: int, columns: Codes) -> None:
         if not len(columns):
             return
-        q = int(self._place[run])
-        self._end[run, columns] = np.inf
+        q, runs = int(self._place[run]), self._runs
+        runs.end[run, columns] = np.inf
         self._ends_so_far += 1
-        self._ended[run, columns] = self._ends_so_far
-        self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[run, columns]])
+        runs.ended[run, columns] = self._ends_so_far
+        self._note_odd("beyond", self._s.vocabulary.places[q], columns[runs.beyond[run, columns]])
         self._seen.note(
             q,
             columns,
-            self._outcome[run, columns],
-            self._action[run, columns],
-            self._took[run, columns],
+            runs.outcome[run, columns],
+            runs.action[run, columns],
+            runs.took[run, columns],
         )
-        self._good[columns] &= self._status[run, columns] <= SUCCESS  # censored ones spoil nothing
-        cut = columns[self._preempted[run, columns]]
-        self._phase[run, columns] = DONE
-        self._phase[run, cut] = GOING
-        for number in np.unique(self._want[run, cut]):
-            own = cut[self._want[run, cut] == number]
+        self._good[columns] &= runs.status[run, columns] <= SUCCESS  # censored ones spoil nothing
+        cut = columns[runs.preempted[run, columns]]
+        runs.phase[run, columns] = DONE
+        runs.phase[run, cut] = GOING
+        for number in np.unique(runs.want[run, cut]):
+            own = cut[runs.want[run, cut] == number]
             able = (
                 self._enabled(self._s.moves[number])[own]
                 if number >= 0
@@ -714,17 +757,17 @@ class Play:
             if able.any():
                 self._fire(self._s.moves[number], own[able], cut=run)
             # what preempts it is not enabled: it ends by itself, with that status
-            self._phase[run, own[~able]] = DONE
+            runs.phase[run, own[~able]] = DONE
             self._note_odd("astray", self._s.moves[number].name, own[~able])
 
     def _free(self, stuck: Codes) -> None:
         """Nothing will happen in these columns: let the ended runs go any way that their status
         allows, else give up."""
         for run, q in enumerate(self._place):
-            lasting = (self._phase[run, stuck] == GOING) & self._beyond[run, stuck]
+            lasting = (self._runs.phase[run, stuck] == GOING) & self._runs.beyond[run, stuck]
             self._note_odd("beyond", self._s.vocabulary.places[q], stuck[lasting])
-        held = ((self._want[:, stuck] >= 0) & (self._phase[:, stuck] == DONE)).any(axis=0)
-        self._want[:, stuck[held]] = -1
+        held = ((self._runs.want[:, stuck] >= 0) & (self._runs.phase[:, stuck] == DONE)).any(axis=0)
+        self._runs.want[:, stuck[held]] = -1
         dead = np.zeros(len(self._column), np.bool_)
         dead[stuck[~held]] = True
         for move in self._barred:
@@ -743,7 +786,7 @@ class Play:
         )
         back = self._taken & (self._tokens == self._s.initial[:, None]).all(axis=0)
         awaited = self._awaited[self._place]
-        phase, want = self._phase[awaited], self._want[awaited]
+        phase, want = self._runs.phase[awaited], self._runs.want[awaited]
         # an ended one whose measured transition is not enabled goes another way first: `_free`
         busy = ((phase == GOING) | ((phase == DONE) & (want >= 0))).any(axis=0)
         return np.where(busy, 0, np.where(back, 1, verdicts[inverse.ravel()]))
@@ -778,10 +821,10 @@ class Play:
         self._seen = self._seen.of(kept)
         for fork in self._forks:
             fork.keep(kept)
-        self._pulses = {event: first[kept] for event, first in self._pulses.items()}
-        for name in (
-            "_column", "_replicate", "_now", "_begun", "_taken", "_goals", "_good", "_valuation",
-        ):  # fmt: skip
+        self._clocks.keep(kept)
+        self._variables.keep(kept)
+        self._runs.keep(kept)
+        for name in ("_column", "_replicate", "_now", "_begun", "_taken", "_goals", "_good"):
             setattr(self, name, getattr(self, name)[kept])
-        for name in (*_BY_RUN, "_tokens", "_due", "_since"):
+        for name in ("_tokens", "_since"):
             setattr(self, name, getattr(self, name)[:, kept])

@@ -31,7 +31,7 @@ from petrobot.coordinator.studies.forecast.distributions import (
     dependences,
     siblings,
 )
-from petrobot.coordinator.studies.forecast.history import Codes, Training, Values, changed
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
@@ -50,6 +50,7 @@ from petrobot.coordinator.studies.forecast.residual import (
     residuals,
     routing,
 )
+from petrobot.coordinator.studies.forecast.whatif import changed
 
 POINT = 40_000
 """Trials simulated for the expected figures of the simulated net. The simulation error of a share

@@ -16,12 +16,7 @@ from petrobot.coordinator.learning.propagation import limits_of
 from petrobot.coordinator.learning.records import WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
 from petrobot.coordinator.studies.forecast.direct import FEWEST, holm, missions
-from petrobot.coordinator.studies.forecast.history import (
-    Codes,
-    Training,
-    Values,
-    reads_variables,
-)
+from petrobot.coordinator.studies.forecast.history import Codes, Training, Values, reads_variables
 from petrobot.coordinator.studies.forecast.net_arrays import Move
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.task import EarlyEvent, EventMemory, Transition
@@ -520,32 +515,34 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
         if row["p_holm"] < LEVEL
         and row["off"] > (OFF_TIME if row["of"] in (TIME, MEAN) else NEGLIGIBLE)
     ]
-    for place, n in sorted(played.beyond.items()):
-        if n > NEGLIGIBLE * trials:
-            out.append(
-                f"in {n / trials:.1%} of the simulated trials a run in {place} lasts longer than "
-                "any measured one, so its end is a guess; train with runs that are not cut off "
-                "so early"
-            )
-    for name, n in sorted(played.astray.items()):
-        if n > NEGLIGIBLE * trials:
-            out.append(
-                f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
-                "not allow it: when a run is preempted depends on more than the run"
-            )
-    for names, n in sorted(played.guessed.items()):
-        if n > NEGLIGIBLE * trials:
-            out.append(
-                f"in {n / trials:.1%} of the simulated trials nothing tells which fires, {names}: "
-                "variables decide, and no training trial came there; train with trials of this form"
-            )
-    for name, n in sorted(played.barred.items()):
-        if n > NEGLIGIBLE * trials:
-            out.append(
-                f"{n / trials:.1%} of the simulated trials stop where only {name} could continue, "
-                "but it starts a run in a place that no training run entered; train with more "
-                "trials"
-            )
+    kinds: list[tuple[Mapping[str, int], str]] = [
+        (
+            played.beyond,
+            "in {share} of the simulated trials a run in {name} lasts longer than any measured "
+            "one, so its end is a guess; train with runs that are not cut off so early",
+        ),
+        (
+            played.astray,
+            "in {share} of the simulated trials {name} comes when the marking does not allow it: "
+            "when a run is preempted depends on more than the run",
+        ),
+        (
+            played.guessed,
+            "in {share} of the simulated trials nothing tells which fires, {name}: variables "
+            "decide, and no training trial came there; train with trials of this form",
+        ),
+        (
+            played.barred,
+            "{share} of the simulated trials stop where only {name} could continue, but it starts "
+            "a run in a place that no training run entered; train with more trials",
+        ),
+    ]
+    out += [
+        text.format(share=f"{n / trials:.1%}", name=name)
+        for counted, text in kinds
+        for name, n in sorted(counted.items())
+        if n > NEGLIGIBLE * trials
+    ]
     if played.endless > NEGLIGIBLE * trials:
         out.append(
             f"{played.endless / trials:.1%} of the simulated trials never end; branches that "

@@ -31,11 +31,7 @@ from petrobot.coordinator.studies.report.action_pictures import (
     put,
     trial_pictures,
 )
-from petrobot.coordinator.studies.report.comparing import (
-    Weighting,
-    objective_intervals,
-    objectives,
-)
+from petrobot.coordinator.studies.report.comparing import Weighting, objective_intervals, objectives
 from petrobot.coordinator.studies.report.page import gallery, html_page, section, table, text
 from petrobot.coordinator.studies.report.plots import declared
 from petrobot.coordinator.studies.report.run_page import gantt_svg

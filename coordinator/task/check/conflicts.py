@@ -171,7 +171,7 @@ def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
         a.place
         for a in t.inputs
         for b in u.inputs
-        if a.place == b.place and _same_token(task, t, a, u, b)
+        if a.place == b.place and _same_token(t, a, u, b)
     }
     shared -= lent(task, t, u)
     common = [task.events[e] for e in t.events if e in u.events]
@@ -208,7 +208,7 @@ def _room(task: Task, t: Transition) -> set[str]:
     }
 
 
-def _same_token(task: Task, t: Transition, a: Input, u: Transition, b: Input) -> bool:
+def _same_token(t: Transition, a: Input, u: Transition, b: Input) -> bool:
     """Whether the two arcs from one place can ask for the same token."""
     if End.GOING in (a.end, b.end):
         return False
@@ -237,7 +237,7 @@ def excluded(task: Task, t: Transition, u: Transition) -> bool:
             single = (
                 a.place == b.place and a.end is not None and task.places[a.place].servers is None
             )
-            if single and _state(a) != _state(b) and not _same_token(task, t, a, u, b):
+            if single and _state(a) != _state(b) and not _same_token(t, a, u, b):
                 return True
     return False
 

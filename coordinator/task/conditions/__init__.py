@@ -18,8 +18,8 @@ from petrobot.coordinator.task.conditions.language import (
 )
 from petrobot.coordinator.task.conditions.regions import (
     Certainty,
+    Decision,
     Domain,
-    Judgement,
     covering,
     equivalent,
     exclusive,
@@ -33,10 +33,10 @@ __all__ = [
     "Compare",
     "ConditionError",
     "ConditionFault",
+    "Decision",
     "Domain",
     "Expression",
     "Fault",
-    "Judgement",
     "Literal",
     "Name",
     "Node",

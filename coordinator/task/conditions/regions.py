@@ -58,7 +58,7 @@ class Certainty(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class Decision:
     """An answer; when refuted, `witness` are values that show it."""
 
     answer: Certainty
@@ -75,12 +75,12 @@ def kind_faults(expression: Expression, domains: Mapping[str, Domain]) -> list[s
     return faults
 
 
-def exclusive(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Judgement:
+def exclusive(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Decision:
     """Whether no values make two of the conditions true (None: always true)."""
     return _decide(conditions, domains, lambda truths: sum(truths) >= 2)
 
 
-def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Judgement:
+def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Decision:
     """Whether all values make at least one of the conditions true, once every name has been
     written."""
     return _decide(conditions, domains, lambda truths: not any(truths))
@@ -101,16 +101,16 @@ def equivalent(one: Expression, other: Expression, domains: Mapping[str, Domain]
 
 def _decide(
     conditions: Sequence[Expression | None], domains: Mapping[str, Domain], bad: Any
-) -> Judgement:
+) -> Decision:
     real = [c for c in conditions if c is not None]
     choices = region_values(real, domains)
     if prod(len(c) for c in choices.values()) > LIMIT:
-        return Judgement(Certainty.UNKNOWN)
+        return Decision(Certainty.UNKNOWN)
     for values in product(*choices.values()):
         assignment = dict(zip(choices, values, strict=True))
         if bad([c is None or _holds(c, assignment) for c in conditions]):
-            return Judgement(Certainty.REFUTED, assignment)
-    return Judgement(Certainty.PROVED)
+            return Decision(Certainty.REFUTED, assignment)
+    return Decision(Certainty.PROVED)
 
 
 def _holds(condition: Expression, values: Mapping[str, Any]) -> bool:

@@ -306,11 +306,7 @@ def _faulty(error: TomlError) -> TaskFileError:
 
 
 def loads(
-    text: str,
-    source: str = "task",
-    *,
-    flat: bool = False,
-    data: Mapping[str, Any] | None = None,
+    text: str, source: str = "task", *, flat: bool = False, data: Mapping[str, Any] | None = None
 ) -> Task:
     """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every
     fault.

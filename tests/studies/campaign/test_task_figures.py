@@ -20,41 +20,20 @@ schema = 1
 name = "two"
 final = "jobs == 0 and free == 1"
 runs_place = "jobs"
-[primitive_tasks.a]
-goal = "a"
-alternatives = ["a_a"]
-deadline = 9.0
-[primitive_tasks.b]
-goal = "b"
-alternatives = ["b_a"]
-deadline = 9.0
-[places.jobs]
-kind = "control"
-tokens = 1
-[places.free]
-kind = "resource"
-tokens = 1
-[places.a]
-kind = "action"
-task = "a"
-[places.b]
-kind = "action"
-task = "b"
-[transitions.begin]
-in = ["jobs", "free"]
-out = ["a"]
-[transitions.on]
-in = ["a:normal"]
-out = ["b"]
-[transitions.off]
-in = ["a:error"]
-out = ["free"]
-[transitions.done]
-in = ["b:normal"]
-out = ["free"]
-[transitions.lost]
-in = ["b:error"]
-out = ["free"]
+[primitive_tasks]
+a = { goal = "a", alternatives = ["a_a"], deadline = 9.0 }
+b = { goal = "b", alternatives = ["b_a"], deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 1 }
+free = { kind = "resource", tokens = 1 }
+a = { kind = "action" }
+b = { kind = "action" }
+[transitions]
+begin = { in = ["jobs", "free"], out = ["a"] }
+on = { in = ["a:normal"], out = ["b"] }
+off = { in = ["a:error"], out = ["free"] }
+done = { in = ["b:normal"], out = ["free"] }
+lost = { in = ["b:error"], out = ["free"] }
 """,
     "two.toml",
 )

@@ -230,33 +230,16 @@ schema = 1
 name = "race"
 final = "jobs == 0 and free == 1"
 runs_place = "jobs"
-[primitive_tasks.look]
-goal = "seen"
-alternatives = ["look"]
-deadline = 2.0
-[primitive_tasks.hold]
-goal = "held"
-alternatives = ["hold"]
-deadline = 9.0
-[primitive_tasks.move]
-goal = "moved"
-alternatives = ["move"]
-deadline = 9.0
-[places.jobs]
-kind = "control"
-tokens = 4
-[places.free]
-kind = "resource"
-tokens = 1
-[places.look]
-kind = "action"
-task = "look"
-[places.hold]
-kind = "action"
-task = "hold"
-[places.move]
-kind = "action"
-task = "move"
+[primitive_tasks]
+look = { goal = "seen", alternatives = ["look"], deadline = 2.0 }
+hold = { goal = "held", alternatives = ["hold"], deadline = 9.0 }
+move = { goal = "moved", alternatives = ["move"], deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 4 }
+free = { kind = "resource", tokens = 1 }
+look = { kind = "action" }
+hold = { kind = "action" }
+move = { kind = "action" }
 begin: jobs, free -> look
 seen: look:normal -> hold, move
 not_seen: look:error -> free
@@ -333,33 +316,18 @@ name = "steps"
 final = "jobs == 0 and free == 1"
 goal_transitions = ["done"]
 runs_place = "jobs"
-[primitive_tasks.look]
-goal = "seen"
-alternatives = ["look_0", "look_1", "look_2", "look_3", "look_4"]
-deadline = 9.0
-[primitive_tasks.plan]
-goal = "planned"
-alternatives = ["plan_0", "plan_1", "plan_2"]
-deadline = 9.0
-[primitive_tasks.grasp]
-goal = "held"
-alternatives = ["grasp_0", "grasp_1"]
-deadline = 9.0
-[places.jobs]
-kind = "control"
-tokens = 4
-[places.free]
-kind = "resource"
-tokens = 1
-[places.look]
-kind = "action"
-task = "look"
-[places.plan]
-kind = "action"
-task = "plan"
-[places.grasp]
-kind = "action"
-task = "grasp"
+[primitive_tasks]
+look.goal = "seen"
+look.alternatives = ["look_0", "look_1", "look_2", "look_3", "look_4"]
+look.deadline = 9.0
+plan = { goal = "planned", alternatives = ["plan_0", "plan_1", "plan_2"], deadline = 9.0 }
+grasp = { goal = "held", alternatives = ["grasp_0", "grasp_1"], deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 4 }
+free = { kind = "resource", tokens = 1 }
+look = { kind = "action" }
+plan = { kind = "action" }
+grasp = { kind = "action" }
 begin: jobs, free -> look
 seen: look:normal -> plan
 not_seen: look:error -> free

@@ -318,19 +318,11 @@ goal_transitions = ["done"]
 runs_place = "jobs"
 [primitive_tasks.move]
 deadline = 9.0
-[places.jobs]
-kind = "control"
-tokens = 4
-[places.free]
-kind = "resource"
-tokens = 1
-[places.fetch]
-kind = "action"
-task = "move"
-timeout = 3.0
-[places.bring]
-kind = "action"
-task = "move"
+[places]
+jobs = { kind = "control", tokens = 4 }
+free = { kind = "resource", tokens = 1 }
+fetch = { kind = "action", task = "move", timeout = 3.0 }
+bring = { kind = "action", task = "move" }
 begin: jobs, free -> fetch
 on: fetch:normal -> bring
 late: fetch:error -> free
@@ -359,7 +351,7 @@ def _moved(k: int) -> Trial:
         (("timeout = 3.0", "timeout = 2.0"), 0.4, 0.4, False),
         (("deadline = 9.0", "deadline = 3.5"), 0.6 * 0.6, 0.6 * 0.6, False),
         (("timeout = 3.0", "timeout = 6.0"), None, None, True),
-        (('[places.bring]\nkind = "action"', '[places.other]\nkind = "action"\ntimeout = 2.5'),
+        (('bring = { kind = "action"', 'other = { kind = "action", timeout = 2.5'),
          0.6 * 0.4, None, False),
         # a run token that is given back ends its trial
         (('in = ["fetch:error"]\nout = ["free"]', 'in = ["fetch:error"]\nout = ["free", "jobs"]'),

@@ -42,25 +42,14 @@ schema = 1
 [task]
 name = "net"
 {task}
-[primitive_tasks.a]
-goal = "a"
-alternatives = ["run_a"]
-deadline = 99.0
-[primitive_tasks.b]
-goal = "b"
-alternatives = ["run_b"]
-deadline = 99.0
-[places.jobs]
-kind = "control"
-tokens = 1
-[places.a]
-kind = "action"
-task = "a"
-[places.b]
-kind = "action"
-task = "b"
-[places.end]
-kind = "control"
+[primitive_tasks]
+a = { goal = "a", alternatives = ["run_a"], deadline = 99.0 }
+b = { goal = "b", alternatives = ["run_b"], deadline = 99.0 }
+[places]
+jobs = { kind = "control", tokens = 1 }
+a = { kind = "action" }
+b = { kind = "action" }
+end = { kind = "control" }
 """
 
 
@@ -367,8 +356,7 @@ def test_servers_and_runs_that_wait_for_a_place_are_those_of_the_engine(
     """Parts in a queue for several servers; ended runs stay until the tray has room or until there
     is a pair of them, and further runs begin meanwhile."""
     text = LINE.format(a=a, b=b, pair=pair, tray=tray, parts=pair * rounds, left=rounds)
-    head = HEAD.replace('[places.a]\nkind = "action"\ntask = "a"\n', "")
-    head = head.replace('[places.b]\nkind = "action"\ntask = "b"\n', "")
+    head = HEAD.replace('a = { kind = "action" }\nb = { kind = "action" }\n', "")
     task = loads(with_transitions(head.replace("{task}", GOAL) + text), "net.toml")
     trial = by_engine(task, {}, {"a": 1.0, "b": long})
     training = Training.of(task, [trial])
@@ -678,7 +666,8 @@ b_done: b:normal -> end
 b_lost: b:error -> lost
 """
     keys = with_transitions(HEAD.replace("{task}", GOAL) + text)
-    task = loads(keys.replace('\ntask = "a"', '\ntask = "a"\ntries = 3'), "net.toml")
+    keys = keys.replace('a = { kind = "action"', 'a = { kind = "action", tries = 3')
+    task = loads(keys, "net.toml")
     trials = [Trial(1, 0.0, runs=[entry("a", 1.0, status)]) for status in ("success", "error")]
     training = Training.of(task, trials, whole=False)
     drawer = Drawer(RunDistributions(training), {}, np.ones((1, 2)), np.random.default_rng(1))
@@ -723,8 +712,9 @@ b_done: b:normal -> heard
 b_lost: b:error -> heard
 """
     keys = with_transitions(HEAD.replace("{task}", GOAL) + text)
-    keys = keys.replace('\ntask = "a"', '\ntask = "a"\ntries = 3')
-    task = loads(keys.replace('\ntask = "b"', '\ntask = "b"\nlisten = true'), "net.toml")
+    keys = keys.replace('a = { kind = "action"', 'a = { kind = "action", tries = 3')
+    keys = keys.replace('b = { kind = "action"', 'b = { kind = "action", listen = true')
+    task = loads(keys, "net.toml")
     trials = []
     for n in (1, 1, 2, 3):
         ways = [("error", "a.retry")] * (n - 1) + [("success", ("done", "done.1", "done.2")[n - 1])]

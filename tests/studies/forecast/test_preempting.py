@@ -40,32 +40,20 @@ name = "scan"
 goal_transitions = ["found"]
 runs_place = "parts"
 final = "parts == 0 and idle == 1"
-[primitive_tasks.locate]
-goal = "located"
-alternatives = ["locate_a"]
-deadline = 9.0
-[primitive_tasks.watch]
-goal = "watched"
-alternatives = ["watch_a"]
-deadline = 9.0
+[primitive_tasks]
+locate = { goal = "located", alternatives = ["locate_a"], deadline = 9.0 }
+watch = { goal = "watched", alternatives = ["watch_a"], deadline = 9.0 }
 [events.bell]
 scope = "external"
 memory = "pulse"
 mean_wait = 1.0
 [variables.dark]
 type = "bool"
-[places.parts]
-kind = "control"
-tokens = 4
-[places.idle]
-kind = "resource"
-tokens = 1
-[places.locate]
-kind = "action"
-task = "locate"
-[places.watch]
-kind = "action"
-task = "watch"
+[places]
+parts = { kind = "control", tokens = 4 }
+idle = { kind = "resource", tokens = 1 }
+locate = { kind = "action" }
+watch = { kind = "action" }
 next: parts, idle -> watch, locate
 """)
 ALONE = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
@@ -453,16 +441,11 @@ def test_a_run_beyond_the_longest_one_ends_at_the_latest_at_its_deadline() -> No
 
 def test_without_measurements_declared_durations_race(tmp_path: object) -> None:
     """Before any run, the declared estimates are used: a preempting end needs no declared wait."""
-    declared = ONE_WAY.replace(
-        "[primitive_tasks.watch]",
-        "[primitive_tasks.locate.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
-        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 "
-        "}\n[primitive_tasks.watch]",
-    ).replace(
-        "[events.bell]",
-        "[primitive_tasks.watch.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
-        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 }\n[events.bell]",
+    guess = (
+        "deadline = 9.0, estimates = { success = { share = 1.0, mean = 1.0, cv = 1.0 }, "
+        "failure = { share = 0.0, mean = 0.0 }, error = { share = 0.0, mean = 0.0 } }"
     )
+    declared = ONE_WAY.replace("deadline = 9.0", guess)
     from petrobot.coordinator.analysis.time.task_forecast import forecast
 
     found = forecast(stochastic_view(loads(declared, "scan.toml")))
