@@ -65,7 +65,7 @@ MUTATIONS = (
         "results are acknowledged before the journal is synced",
         RUN + "executor.py",
         "        if not self.store.safe:\n            sync",
-        "        while then:\n            then.pop()(now)\n        if not self.store.safe:\n            sync",
+        "        while then: then.pop()(now)\n        if not self.store.safe:\n            sync",
         "tests/run",
     ),
     _m(
