@@ -414,7 +414,7 @@ def test_a_task_that_can_deadlock_is_refused(
     )  # its actions are on no node of the shipped services.toml
     services = tmp_path / "services.toml"
     action = (
-        '[actions.{0}]\nrun = "petrobot.services.action:success"\ntask = "{0}"\nnode = "robot"\n'
+        '[actions.{0}]\nrun = "petrobot.services.scripted:nothing"\ntask = "{0}"\nnode = "robot"\n'
     )
     node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
     services.write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")

@@ -25,11 +25,11 @@ schema = 1
 host = "127.0.0.1"
 port = 7399
 [actions.work]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "work"
 node = "robot"
 [actions.recover]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "recover"
 node = "robot"
 """
