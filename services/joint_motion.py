@@ -67,7 +67,8 @@ class Axis(Driver):
         """Begin to move to a station or a position (m). Raises ValueError if it is unknown, beyond
         an end, or outside the workspace."""
         if isinstance(to, str) and to not in self.stations:
-            raise ValueError(f"to: {to!r} is none of {', '.join(self.stations) or 'no stations'}")
+            known = ", ".join(self.stations) or "its stations: it has none; give m"
+            raise ValueError(f"to: {to!r} is none of {known}")
         goal = numbers([self.stations[to] if isinstance(to, str) else to], 1, "to")[0]
         low, high = self._ends()
         if not low <= goal <= high:

@@ -281,6 +281,17 @@ def test_keys_of_an_axis_that_make_no_sense_are_refused(keys: dict[str, Any], wo
         Lift(keys, None)
 
 
+def test_an_axis_without_stations_moves_between_its_ends() -> None:
+    class Rail(Axis):
+        ends = [0.0, 1.0]  # noqa: RUF012 - as its users write it
+
+    rail = Rail({}, None)
+    with pytest.raises(ValueError, match="to: 'left' is none of its stations: it has none; give"):
+        rail.command(0.0, {"to": "left"})
+    rail.command(0.0, {"to": 0.5})
+    assert moves(rail)[-1] == 0.5
+
+
 def test_an_axis_must_lie_along_x_y_or_z() -> None:
     class Up(Lift):
         along = "up"
