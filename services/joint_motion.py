@@ -35,7 +35,7 @@ class Axis(Driver):
     allowed: float = math.inf
     """No faster than this at present (m/s). `step` may set it, also to 0."""
     top_speed: float = key(0.5, "m/s")
-    acceleration: float = key(1.0, "m/s^2")
+    acceleration: float = key(4.0, "m/s^2")
     stations: dict[str, float] = key({}, "positions by name, m")
     ends: list[float] = key([], "least and greatest position, m; if empty, those of the stations")
     _share = 1.0

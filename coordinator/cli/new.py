@@ -173,7 +173,7 @@ async def drive(ctx: Context[Remote], *, to: float) -> Result:
 
 def test_it_arrives():
     device = {Class}({"top_speed": 0.5}, None)
-    assert 1.4 < rehearse(drive, device=device, to=0.5).seconds < 1.6 and device.at == 0.5
+    assert 1.0 < rehearse(drive, device=device, to=0.5).seconds < 1.2 and device.at == 0.5
 
 
 def test_it_refuses_what_is_out_of_reach():
@@ -258,7 +258,7 @@ from petrobot import check_driver, rehearse, rehearse_task
 def test_it_moves():
     axis = Slide({"top_speed": 0.5}, None)
     played = rehearse(move, device=axis, to=0.5)
-    assert played.result.status == "success" and 1.4 < played.seconds < 1.6
+    assert played.result.status == "success" and 1.0 < played.seconds < 1.2
 
 
 def test_the_driver_keeps_the_rules_of_drivers():

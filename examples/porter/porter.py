@@ -30,7 +30,6 @@ class Gripper(Axis):
     period = 0.02
     obeys = (*Axis.obeys, "dry_run")
     stations = OPENINGS
-    acceleration = 4.0
     slips: float = key(0.2, "share of the parts that slip out")
 
     def setup(self) -> None:
