@@ -66,9 +66,11 @@ class Result:
     executed="unknown")`; the `tries` of a place and conditions of a task depend on it."""
 
 
-def success(**values: Any) -> Result:
+def success(text: str = "", /, **values: Any) -> Result:
     """Return SUCCESS: the specification was fully met."""
-    return Result(Status.SUCCESS, values)
+    if not issubclass(type(text), str):  # a value without its name
+        raise TypeError(f"success: expected a text, found {text!r:.60}; write success(name=value)")
+    return Result(Status.SUCCESS, values, text=text)
 
 
 def failure(cause: str, text: str = "", **values: Any) -> Result:
@@ -162,11 +164,14 @@ class Context(Protocol[Device]):
         """The action's device: its driver, or a `Remote` of it if the driver is cyclic; None
         without a device."""
 
-    async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
-        """Send a command to the device's driver, and wait until the driver has accepted it.
+    async def command(
+        self, body: Mapping[str, Any], timeout: float = 1.0, *, until: str = ""
+    ) -> Mapping[str, Any]:
+        """Send a command to the device's driver, and wait until the driver has accepted it; with
+        `until`, also until `device.state[until]` is true. Return the state then.
 
         Raises CommandRefused with the driver's reason if it refuses, or if it has not handled the
-        command after `timeout` seconds.
+        command after `timeout` seconds. Only the deadline of the run limits the wait for `until`.
         """
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
@@ -185,9 +190,10 @@ class Context(Protocol[Device]):
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise a named internal event during the run."""
 
-    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+    def verdict(self, run: str, result: Result) -> None:
         """Give the verdict on an earlier run whose result was `provisional`: its status is
-        corrected once, for the estimates only. `run` is the `ctx.run` of that run, on any node."""
+        corrected once, for the estimates only. `run` is the `ctx.run` of that run, on any node; of
+        `result`, status, cause and text count."""
 
     def progress(self, fraction: float, **data: Any) -> None:
         """Report the progress of the run, 0 to 1, with plain data for people."""

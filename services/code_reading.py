@@ -21,13 +21,14 @@ import os
 import random
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from types import CodeType
 from typing import Any, get_args, get_type_hints
 
+import petrobot
 from petrobot.services import action as actions
 from petrobot.services.comm.location_file import MEMORY_CALLS, resolve
 from petrobot.services.comm.location_file.code import SLOW
@@ -394,7 +395,28 @@ def _look(code: _Code, in_action: bool) -> _Seen:
     return code.found[in_action]
 
 
+def _commands(node: ast.AST | None) -> bool:
+    """Whether it is a `ctx.command(...)`."""
+    node = node.value if isinstance(node, ast.Await) else node
+    orders = {f"{one}.command" for one in CONTEXT}
+    return isinstance(node, ast.Call) and ast.unparse(node.func) in orders
+
+
+def _states(code: _Code) -> set[str]:
+    """Return the variables that hold nothing but states which `ctx.command` returned."""
+    stored = [n for n in code.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)]
+    given = [
+        target.id
+        for node in code.nodes
+        if isinstance(node, ast.Assign) and _commands(node.value)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    ]
+    return {name for name in given if given.count(name) == [n.id for n in stored].count(name)}
+
+
 def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
+    states = _states(code)
     for node in code.nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
@@ -416,13 +438,17 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
             _loops(code, node, seen)
         if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
             name = str(node.slice.value)
-            state = ast.unparse(node.value) in {f"{one}.state" for one in DEVICE}
+            state = ast.unparse(node.value) in {f"{one}.state" for one in DEVICE} | states
             if state and name not in code.asked and node not in code.tried:
                 seen.reads.setdefault(name, (code.file, node.lineno))
         if not isinstance(node, ast.Call):
             continue
         made = code.value(node.func)
         _writes(code, node, made, seen)
+        if _commands(node):
+            for until in (code.value(k.value) for k in node.keywords if k.arg == "until"):
+                if isinstance(until, str) and until and node not in code.tried:
+                    seen.reads.setdefault(until, (code.file, node.lineno))
         if any(made is one for one in MADE):  # what it names need not be hashable
             _result(code, node, made, seen)
         elif made is actions.Result:
@@ -635,6 +661,10 @@ def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) 
         except TypeError as fault:
             text = f"`{ast.unparse(node)}`: {fault}; write `{MADE[made]}`"
             seen.faults.append((code.file, node.lineno, text))
+        for shown in node.args[:1] if made is actions.success else ():
+            if (kind := _kind(code, shown)) not in ("", "str"):
+                words = f"`{ast.unparse(node)}`: its text is of type {kind}; write `{MADE[made]}`"
+                seen.faults.append((code.file, node.lineno, words))
     for keyword in node.keywords:
         if keyword.arg is None:
             seen.complete = False
@@ -793,16 +823,39 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
 
 def _state(thing: type) -> list[str] | None:
     """Return the keys of a cyclic driver's state; None if its source does not show them."""
-    method = getattr(thing, "state", None)
-    if getattr(thing, "period", None) is None or not inspect.isfunction(method):
+    if getattr(thing, "period", None) is None or not hasattr(thing, "state"):
         return None
-    code = _code(method)
-    given = [node.value for node in code.nodes if isinstance(node, ast.Return)] if code else []
-    keys = [key for value in given if isinstance(value, ast.Dict) for key in value.keys]
-    if not given or not all(isinstance(value, ast.Dict) for value in given):
+    names = _state_of(thing.__mro__)
+    return None if names is None else sorted(names)
+
+
+def _state_of(classes: Sequence[type]) -> set[str] | None:
+    """Return the keys that `state` of the first class that has it returns; `super().state()` in it
+    is that of the classes after it."""
+    at = next((n for n, one in enumerate(classes) if "state" in vars(one)), len(classes))
+    method = vars(classes[at])["state"] if at < len(classes) else None
+    code = _code(method) if inspect.isfunction(method) else None
+    parts = [node.value for node in code.nodes if isinstance(node, ast.Return)] if code else []
+    names = set[str]()
+    if not parts:
         return None
-    names = [key.value for key in keys if isinstance(key, ast.Constant)]
-    return sorted(map(str, names)) if len(names) == len(keys) else None
+    while parts:
+        match parts.pop():
+            case ast.BinOp(op=ast.BitOr(), left=left, right=right):
+                parts += [left, right]
+            case ast.Dict(keys=keys, values=values):
+                parts += [v for k, v in zip(keys, values, strict=True) if k is None]
+                words = [k.value for k in keys if isinstance(k, ast.Constant)]
+                if len(words) < len([k for k in keys if k is not None]):
+                    return None
+                names |= set(map(str, words))
+            case other:
+                if other is None or ast.unparse(other) != "super().state()":
+                    return None
+                if (inherited := _state_of(classes[at + 1 :])) is None:
+                    return None
+                names |= inherited
+    return names
 
 
 def _members(thing: type) -> list[str] | None:
@@ -908,7 +961,8 @@ def _faults_of_driver(
 
 def _unset(thing: type) -> list[str]:
     """Return what a constructor of its own leaves unset, of all that the driver uses."""
-    if not issubclass(thing, Driver) or thing.__init__ is Driver.__init__:
+    maker = next(base for base in thing.__mro__ if "__init__" in vars(base))
+    if not issubclass(thing, Driver) or maker.__module__.startswith(f"{petrobot.__name__}."):
         return []
     nodes = [node for code in _reachable(thing) for node in code.nodes]
     own = [n for n in nodes if isinstance(n, ast.Attribute) and ast.unparse(n.value) == "self"]

@@ -143,6 +143,12 @@ class Key:
         elif self.default is not _Required:
             self.kind = type(self.default)
 
+    def with_default(self, default: Any) -> Key:
+        """Return the same key with another default."""
+        other = copy(self)
+        other.default = default
+        return other
+
     def fault(self, config: Mapping[str, Any]) -> str:
         """Return what is wrong with the key's value in a table, or with its default; empty if
         nothing is."""
@@ -314,13 +320,16 @@ RESERVED = frozenset(
 
 
 def keys_of(driver: type) -> dict[str, Key]:
-    """Return the keys that a driver's class declares, those of its base classes first."""
-    return {
-        name: value
-        for base in reversed(driver.__mro__)
-        for name, value in vars(base).items()
-        if isinstance(value, Key)
-    }
+    """Return the keys that a driver's class declares, those of its base classes first. A plain
+    value that a derived class gives to the key of a base class is the key's new default."""
+    found = dict[str, Key]()
+    for base in reversed(driver.__mro__):
+        for name, value in vars(base).items():
+            if isinstance(value, Key):
+                found[name] = value
+            elif name in found and not callable(value) and not hasattr(value, "__get__"):
+                found[name] = found[name].with_default(value)
+    return found
 
 
 def read_keys(driver: type, config: Mapping[str, Any]) -> dict[str, Any]:
@@ -376,8 +385,8 @@ def faults_of_limits(
         if name not in config or own or still:
             continue
         if name not in obeys:
-            text = f'{name}: {driver.__name__} does not obey it; do without it, or write obeys = ("'
-            faults.append((name, f'{text}{name}",) in the driver and obey it there'))
+            text = f"{name}: {driver.__name__} does not obey it; do without it, or write obeys = "
+            faults.append((name, f"{text}{(*obeys, name)} in the driver and obey it there"))
             continue
         value = config[name]
         if name == "dry_run" and not isinstance(value, bool):

@@ -1,16 +1,112 @@
-"""Set points of joints that move together, within the limits that a device's table sets."""
+"""Set points of one axis, or of joints that move together, within the limits that a device's table
+sets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
-from petrobot.services.device import Driver, numbers
+from petrobot.services.device import Driver, Ports, key, numbers, table
 
 PART: Final = 0.02
 """Greatest change of a joint (rad or m) between two checked points of a way."""
+
+
+class Axis(Driver):
+    """A driver of one axis, which is simulated: it moves to a station or a position (m) within its
+    limits of speed and acceleration, and obeys pauses and the keys `speed` and `workspace`.
+
+    Derive a class from it, and override what the device does in addition. One with a motor writes
+    `at` to it after `super().step(now)`; if it does not write in a dry run, add that to `obeys`.
+    """
+
+    period = 0.01
+    obeys: Collection[str] = ("speed", "workspace", "pause")
+    along = "x"
+    """Direction of the axis in the workspace: x, y or z."""
+    at: float = 0.0
+    """Where it is (m); first at 0, or at the end next to it."""
+    velocity: float = 0.0
+    """How fast it moves (m/s)."""
+    goal: float | None = None
+    """Where it moves to (m); None after `stop`."""
+    allowed: float = math.inf
+    """No faster than this at present (m/s). `step` may set it, also to 0."""
+    top_speed: float = key(0.5, "m/s")
+    acceleration: float = key(4.0, "m/s^2")
+    stations: dict[str, float] = key({}, "positions by name, m")
+    ends: list[float] = key([], "least and greatest position, m; if empty, those of the stations")
+    _share = 1.0
+
+    def __init__(self, config: Mapping[str, Any], ports: Ports | None) -> None:
+        """Raises ValueError also for limits and stations that make no sense."""
+        super().__init__(config, ports)
+        for name, at in self.stations.items():
+            numbers([at], 1, f"stations.{name}")
+        if not self.ends and not self.stations:
+            raise ValueError("ends: is missing; give [least, greatest] position in m, or stations")
+        low, high = self._ends()
+        if low > high:
+            raise ValueError(f"ends: expected [least, greatest] position, found {self.ends}")
+        if beyond := [name for name, at in self.stations.items() if not low <= at <= high]:
+            raise ValueError(f"stations: {', '.join(beyond)} lies beyond the ends {self.ends} m")
+        if not (self.top_speed > 0.0 and self.acceleration > 0.0):
+            limits = f"{self.top_speed:g} and {self.acceleration:g}"
+            raise ValueError(f"top_speed, acceleration: expected numbers above 0, found {limits}")
+        if self.along not in ("x", "y", "z"):
+            raise ValueError(f"along: expected x, y or z in the driver, found {self.along!r}")
+        self.at = min(high, max(low, self.at))
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        """`{"to": station or m}`, with `"speed"` if it shall be a share of the top speed."""
+        self.move(**table(dict(body), "command", ("to",), ("speed",)))
+
+    def move(self, to: str | float, speed: float = 1.0) -> None:
+        """Begin to move to a station or a position (m). Raises ValueError if it is unknown, beyond
+        an end, or outside the workspace."""
+        if isinstance(to, str) and to not in self.stations:
+            known = ", ".join(self.stations) or "its stations: it has none; give m"
+            raise ValueError(f"to: {to!r} is none of {known}")
+        goal = numbers([self.stations[to] if isinstance(to, str) else to], 1, "to")[0]
+        low, high = self._ends()
+        if not low <= goal <= high:
+            raise ValueError(f"to: expected {low:g} to {high:g} m, found {goal:g}")
+        if outside := self.workspace.outside([goal if a == self.along else 0.0 for a in "xyz"]):
+            raise ValueError(f"to: {outside}")
+        self.goal, self._share = goal, _share_of(speed)
+
+    def _ends(self) -> list[float]:
+        stations = self.stations.values()
+        return numbers(self.ends or [min(stations), max(stations)], 2, "ends")
+
+    def step(self, now: float) -> None:
+        """Move by one period."""
+        dt = float(self.period)
+        change, wish = self.acceleration * dt, 0.0
+        if self.goal is not None and not self.paused:
+            most = self.speed * min(self.top_speed * self._share, max(0.0, self.allowed))
+            left = self.goal - self.at
+            wish = math.copysign(min(most, _braking(abs(left), change, dt)), left)
+        self.velocity += min(change, max(-change, wish - self.velocity))
+        self.at += self.velocity * dt
+        there = self.goal is not None and abs(self.goal - self.at) < 1e-9
+        if self.goal is not None and there and abs(self.velocity) <= change + 1e-9:
+            self.at, self.velocity = self.goal, 0.0
+
+    def state(self) -> Mapping[str, Any]:
+        """Where it is (m), how fast (m/s), and whether it has arrived at the goal."""
+        arrived = self.at == self.goal and self.velocity == 0.0
+        return {"at": self.at, "velocity": self.velocity, "arrived": arrived}
+
+    def stop(self, now: float) -> None:
+        """Brake, and stay there."""
+        self.goal = None
+
+    def stopped(self) -> bool:
+        """Whether it stands still, and is not about to move."""
+        return self.velocity == 0.0 and (self.paused or self.goal in (None, self.at))
 
 
 class JointMotion:
@@ -77,8 +173,7 @@ class JointMotion:
         for (name, (low, high)), at in zip(self.limits.items(), goal, strict=True):
             if not low <= at <= high:
                 raise ValueError(f"{name}: expected {low:.3f} to {high:.3f}, found {at:.3f}")
-        if not 0.0 < (part := numbers([share], 1, "speed")[0]) <= 1.0:
-            raise ValueError(f"speed: expected a share above 0 and at most 1, found {share!r}")
+        part = _share_of(share)
         if self._rate > 0.0:
             raise ValueError("it is still moving: wait, or stop it first")
         way = [list(self.q), *(list(map(float, each)) for each in positions)]
@@ -117,10 +212,8 @@ class JointMotion:
             return
         dt = float(self._driver.period or 0.0)
         left, change = self._far[-1] - self._at, self._acceleration * dt
-        # The speed from which `periods` of braking, one change of speed each, end on the goal.
-        periods = max(1, math.ceil(math.sqrt(0.25 + 2 * left / (change * dt)) - 0.5))
-        braking = left / (periods * dt) + change * (periods - 1) / 2
-        wish = 0.0 if self._rests or self.goal is None else min(self._most, braking)
+        rests = self._rests or self.goal is None
+        wish = 0.0 if rests else min(self._most, _braking(left, change, dt))
         self._rate += min(change, max(-change, wish - self._rate))
         self._at += self._rate * dt
         if self.goal is None and self._rate <= 0.0:
@@ -142,6 +235,20 @@ class JointMotion:
     def halt(self, positions: Sequence[float]) -> None:
         """Be at these positions at once, without a way: where the joints are, for example."""
         self.q, self.goal, self._way, self._rate = list(positions), None, [], 0.0
+
+
+def _share_of(speed: Any) -> float:
+    share = numbers([speed], 1, "speed")[0]
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"speed: expected a share above 0 and at most 1, found {speed!r}")
+    return share
+
+
+def _braking(left: float, change: float, dt: float) -> float:
+    """Return the speed from which braking, by one `change` of speed each period, ends on the
+    goal, `left` m or rad ahead."""
+    periods = max(1, math.ceil(math.sqrt(0.25 + 2 * left / (change * dt)) - 0.5))
+    return left / (periods * dt) + change * (periods - 1) / 2
 
 
 def largest_change(begin: Sequence[float], end: Sequence[float]) -> float:

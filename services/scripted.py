@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.services.action import Context, Result, Status
+from petrobot.services.action import Context, Result, Status, success
 from petrobot.services.comm.location_file.reading import nearest
 from petrobot.services.host.toml_text import TomlError, read_toml
 
@@ -77,6 +77,11 @@ class Scripted:
         line = self._lines[self._runs % len(self._lines)]
         self._runs += 1
         return _play(ctx, line)
+
+
+def nothing(ctx: Context, **_: Any) -> Result:
+    """Do nothing, and succeed: in the place of an action that does not exist yet."""
+    return success()
 
 
 async def _play(ctx: Context, line: ScriptedRun) -> Result:

@@ -104,7 +104,7 @@ def _opened(task: Task, inside: str) -> tuple[Task, str, str]:
                     task,
                     places=subnet.places,
                     transitions=subnet.transitions,
-                    errors_to=subnet.errors_to,
+                    errors_to=subnet.errors_lead_to,
                 )
             )
             prefix = f"{prefix}{part}."

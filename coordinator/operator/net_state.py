@@ -78,7 +78,7 @@ def _written(net: Task, prefix: str) -> Iterator[tuple[str, Transition]]:
                 net,
                 places=subnet.places,
                 transitions=subnet.transitions,
-                errors_to=subnet.errors_to,
+                errors_to=subnet.errors_lead_to,
             )
             yield from _written(inner, f"{prefix}{place.name}.")
 

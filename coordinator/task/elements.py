@@ -382,6 +382,12 @@ class Subnet:
     error: str = ""
     """Place from which arcs `macro:error` take."""
     errors_to: str = ""
-    """Place that receives the errors of its action places without an `error` arc; empty: none."""
+    """Place that receives the errors of its action places without an `error` arc; empty: that of
+    `error`."""
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     """What a macro place has to give in `args`."""
+
+    @property
+    def errors_lead_to(self) -> str:
+        """Place that receives those errors; empty if the subnet has no place for them."""
+        return self.errors_to or self.error

@@ -221,7 +221,7 @@ def _unfold(flat: _Flat, scope: _Scope, transitions: Transitions, inside: tuple[
         flat.entered[name] = subnet = flat.subnets[place.subnet]
         inner = _Scope(f"{name}.", subnet.places, _bound(scope, place, subnet))
         own = _with_error_branches(
-            subnet.places, subnet.transitions, flat.subnets, subnet.errors_to
+            subnet.places, subnet.transitions, flat.subnets, subnet.errors_lead_to
         )
         _unfold(flat, inner, own, (*inside, place.subnet))
     for transition in transitions.values():

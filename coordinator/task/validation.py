@@ -61,6 +61,8 @@ def faults(task: Task) -> tuple[Fault, ...]:
     for subnet in task.subnets.values():
         found += _subnet(task, subnet)
     if not found:
+        found += _macro_exits(task)  # first: without them the net cannot be made flat
+    if not found:
         found += _whole(task)
     return tuple(found)
 
@@ -604,7 +606,6 @@ def _whole(task: Task) -> Iterator[Fault]:
     except CircleError as circle:
         yield Fault(circle.key, str(circle), "break the circle")
         return
-    yield from _macro_exits(task)
     domains = condition_domains(flat)
     places = {
         name for net in (task.places, *(s.places for s in task.subnets.values())) for name in net

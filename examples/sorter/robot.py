@@ -1,44 +1,19 @@
 """A robot that sorts parts: an arm on a rail and a barcode scanner, both simulated."""
 
-from collections.abc import Mapping
-from typing import Any
-
-from petrobot import Context, Driver, Remote, Result, error, failure, key, success
+from petrobot import Axis, Context, Driver, Remote, Result, error, failure, key, success
 
 STATIONS = {"home": 0.0, "belt": 0.2, "left": 0.5, "right": 0.8}  # m along the rail
 
 
-class Arm(Driver):
-    """Moves along a rail. A real one would send its speed to a motor in `step`, but not in a
-    `dry_run`."""
+class Arm(Axis):
+    """Moves along a rail."""
 
-    period = 0.01  # s between two steps
-    obeys = ("speed", "workspace", "dry_run", "pause")  # first motions, and pause
-    top_speed: float = key(0.5, "m/s")
-
-    def setup(self) -> None:
-        self.at = self.goal = 0.0  # m
-
-    def command(self, now: float, body: Mapping[str, Any]) -> None:
-        if body.get("to") not in STATIONS:
-            raise ValueError(f"to: {body.get('to')!r} is none of {', '.join(STATIONS)}")
-        if outside := self.workspace.outside((STATIONS[body["to"]], 0.0, 0.0)):
-            raise ValueError(outside)
-        self.goal = STATIONS[body["to"]]
+    obeys = (*Axis.obeys, "dry_run")
+    stations = STATIONS
 
     def step(self, now: float) -> None:
-        if not self.paused:
-            most = self.speed * self.top_speed * self.period
-            self.at += max(-most, min(most, self.goal - self.at))
-
-    def state(self) -> Mapping[str, Any]:
-        return {"at": self.at, "arrived": self.stopped()}
-
-    def stop(self, now: float) -> None:
-        self.goal = self.at
-
-    def stopped(self) -> bool:
-        return self.at == self.goal
+        super().step(now)
+        # A real one writes self.at to its motor here, unless self.dry_run.
 
 
 class Scanner(Driver):
@@ -53,9 +28,7 @@ class Scanner(Driver):
 
 async def move(ctx: Context[Remote], *, to: str) -> Result:
     """Move the arm to a station."""
-    await ctx.command({"to": to})
-    if not await ctx.wait(lambda: ctx.device.state["arrived"], 5.0):
-        return error("blocked", f"the arm did not reach {to} within 5 s")
+    await ctx.command({"to": to}, until="arrived")
     return success()
 
 

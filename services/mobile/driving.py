@@ -276,9 +276,9 @@ async def _follow(
         ctx.device.send({"do": "rest"})
         raise
     if recovery and result.status is Status.SUCCESS:
-        ctx.verdict(recovery, Status.SUCCESS)
+        ctx.verdict(recovery, success())
     elif recovery and result.cause in ("unannounced_end", "no_line"):
-        ctx.verdict(recovery, Status.FAILURE, "not_the_track", result.text)
+        ctx.verdict(recovery, failure("not_the_track", result.text))
     if result.cause:
         await drive.rest()
     return result

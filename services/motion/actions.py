@@ -103,9 +103,9 @@ async def follow_and_wait(
     finally:
         ctx.device.send({"do": "hold"})  # Also when the run is preempted.
         if moved and ctx.device.state["ball_in_cup"]:
-            ctx.verdict(moved, Status.SUCCESS)
+            ctx.verdict(moved, success())
     if moved and result.status is Status.FAILURE:
-        ctx.verdict(moved, Status.FAILURE, result.cause, result.text)
+        ctx.verdict(moved, result)
     return result
 
 

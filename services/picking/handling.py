@@ -18,7 +18,6 @@ from petrobot.services.action import (
     CommandRefused,
     Context,
     Result,
-    Status,
     error,
     failure,
     provisional,
@@ -333,10 +332,8 @@ async def verify_width(
         (found, ("missed", "wrong_kind")),
         (picked, ("missed", "askew", "slipped")),
     ):
-        if run and cause in blamed:
-            ctx.verdict(run, Status.FAILURE, cause, text)
-        elif run:
-            ctx.verdict(run, Status.SUCCESS)
+        if run:
+            ctx.verdict(run, failure(cause, text) if cause in blamed else success())
     if cause:
         return failure(cause, text)
     return success()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
+from petrobot.services.action import Cancelled, Context, Result, error, failure, success
 from petrobot.services.camera import CameraError
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, Mark
@@ -299,7 +299,7 @@ class _Chase:
         seen = len(self._sights)
         if seen < LEAST_SIGHTS:
             text = f"a ball that rolls from there was seen {seen} times, not {LEAST_SIGHTS}"
-            self._ctx.verdict(run, Status.FAILURE, "not_there", text)
+            self._ctx.verdict(run, failure("not_there", text))
             return
         time, *place = self._located
         first = np.array([s for s in self._sights if s[0] <= self._sights[0][0] + JUDGED_SPAN])
@@ -310,9 +310,9 @@ class _Chase:
         off = float(np.hypot(*(fit[0] - place)))
         if off > within:
             text = f"located {off * 1e3:.1f} mm beside the ball's path, not {within * 1e3:.1f} mm"
-            self._ctx.verdict(run, Status.FAILURE, "inaccurate", text)
+            self._ctx.verdict(run, failure("inaccurate", text))
         else:
-            self._ctx.verdict(run, Status.SUCCESS)
+            self._ctx.verdict(run, success())
 
     def _crossing(self) -> tuple[float, float] | None:
         """Return when (s) and where (y, m) the last sights show that the ball left over the near

@@ -223,10 +223,14 @@ class RunContext:
         checked(event)
         self._report(event)
 
-    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+    def verdict(self, run: str, result: Result) -> None:
         """Give the verdict on an earlier run that ended provisionally. Raises ValueError if the id
-        or the status is not one."""
-        said = RunVerdict(run, Status(status).value, str(cause), str(text))
+        is not one."""
+        try:
+            said = RunVerdict(run, Status(result.status).value, str(result.cause), str(result.text))
+        except AttributeError:
+            wanted = 'a result, such as success() or failure("cause", "text")'
+            raise TypeError(f"verdict: expected {wanted}, found {result!r:.60}") from None
         name = verdict_event(mission_of(run))
         checked(Outcome(run, said.status, cause=said.cause, text=said.text))
         event = Event(name, self._call.service, 0, said.to_data())
@@ -270,9 +274,11 @@ class RunContext:
                 self._report(Cancel(child, "its run no longer waits"))
         return self._answers.pop(child)
 
-    async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
-        """Send a command to the device's driver, and wait until the driver has accepted it. Raises
-        CommandRefused."""
+    async def command(
+        self, body: Mapping[str, Any], timeout: float = 1.0, *, until: str = ""
+    ) -> Mapping[str, Any]:
+        """Send a command to the device's driver, and wait until the driver has accepted it, and
+        until `device.state[until]` is true. Return the state then. Raises CommandRefused."""
         device = self._device
         if not hasattr(device, "send"):
             action = self._call.service
@@ -288,6 +294,12 @@ class RunContext:
             raise CommandRefused(f"the driver did not take {dict(body)} within {timeout:g} s")
         if refused := device.refused:
             raise CommandRefused(refused)
+        state: Mapping[str, Any] = device.state
+        if until and until not in state:
+            known = ", ".join(map(repr, state)) or "nothing"
+            raise ValueError(f"until: the state of the driver has no {until!r}; it has {known}")
+        await self.wait(lambda: not until or bool(device.state[until]))
+        return dict(device.state)
 
     async def get(self, name: str, default: Any = None) -> Any:
         """Read a global-memory variable; `default` if it was never written. Raises CallFailed."""

@@ -35,12 +35,13 @@ if TYPE_CHECKING:
     from petrobot.services.conformance import DriverCheck, check_driver
     from petrobot.services.device import Driver, Ports, Remote, Setpoint, key, numbers, table
     from petrobot.services.joint_chain import JointChain
-    from petrobot.services.joint_motion import JointMotion
+    from petrobot.services.joint_motion import Axis, JointMotion
     from petrobot.services.perform import perform
     from petrobot.services.rehearsal import Rehearsal, rehearse, rehearse_task
     from petrobot.services.session_thread import SessionThread, SimulatedSession
 
 __all__ = [
+    "Axis",
     "ByteLine",
     "CallFailed",
     "CameraDriver",
@@ -85,7 +86,7 @@ _HOMES = {
     "CameraDriver": "petrobot.services.camera",
     "Image": "petrobot.services.comm.streams.image",
     "JointChain": "petrobot.services.joint_chain",
-    "JointMotion": "petrobot.services.joint_motion",
+    **dict.fromkeys(("Axis", "JointMotion"), "petrobot.services.joint_motion"),
     **dict.fromkeys(("DriverCheck", "check_driver"), "petrobot.services.conformance"),
     **dict.fromkeys(("OperatorClient", "OperatorError"), "petrobot.coordinator.operator.client"),
     "perform": "petrobot.services.perform",

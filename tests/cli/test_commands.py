@@ -414,7 +414,7 @@ def test_a_task_that_can_deadlock_is_refused(
     )  # its actions are on no node of the shipped services.toml
     services = tmp_path / "services.toml"
     action = (
-        '[actions.{0}]\nrun = "petrobot.services.action:success"\ntask = "{0}"\nnode = "robot"\n'
+        '[actions.{0}]\nrun = "petrobot.services.scripted:nothing"\ntask = "{0}"\nnode = "robot"\n'
     )
     node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
     services.write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")
@@ -425,7 +425,11 @@ def test_a_task_that_can_deadlock_is_refused(
     assert "error   deadlock free: stuck with " in capsys.readouterr().out
     assert main(["analyse", str(path)]) == 1
     assert "failed" in capsys.readouterr().out
-    assert main(["run", str(path), "--services", str(services), "--mode", "lockstep"]) == 1
+    script = tmp_path / "script.toml"
+    failing = '[actions.{}]\nstatus = "error"\ncause = "provoked"\n'
+    script.write_text("schema = 1\n" + failing.format("work") + failing.format("recover"), "utf-8")
+    run = ["run", str(path), "--services", str(services), "--mode", "lockstep"]
+    assert main([*run, "--mock", str(script)]) == 1
     assert "warning: stuck: deadlock free: " in capsys.readouterr().err
 
 
@@ -813,7 +817,7 @@ def test_a_run_without_its_score_has_its_result_and_a_resume_asks_again(tmp_path
     code = (bot / "bot.py").read_text(encoding="utf-8")
     score = """
 
-def tally(ctx: Context, *, cycles: list[Any]) -> Result:
+def tally(ctx: Context, *, cycles: list) -> Result:
     from pathlib import Path
     if not Path("counted").exists():
         raise OSError("nobody counts")

@@ -184,7 +184,7 @@ SHIPPED: dict[tuple[str, str], tuple[str, ...]] = {
     ("examples/opcua", "petrobot.services.adapters.opcua.session:OpcUaSession"): ("dry_run",),
     ("examples/sorter", "robot:Arm"): LIMITS,
     ("examples/porter", "porter:Base"): LIMITS,
-    ("examples/porter", "porter:Gripper"): ("speed", "dry_run"),
+    ("examples/porter", "porter:Gripper"): LIMITS,
 }
 """What docs/first-motion.md promises: by folder of its location file, each driver that may move
 something, and what it obeys."""
@@ -228,7 +228,7 @@ def test_a_new_driver_and_a_new_robot_obey(
     [
         ("sorter", "robot:Arm", [{"to": "right"}, {"to": "home"}]),
         ("porter", "porter:Base", [{"to": "shelf"}, {"to": "dock"}]),
-        ("porter", "porter:Gripper", []),
+        ("porter", "porter:Gripper", [{"to": "open"}, {"to": "closed"}]),
         ("porter", "porter:Button", []),
     ],
 )

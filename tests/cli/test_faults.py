@@ -25,11 +25,11 @@ schema = 1
 host = "127.0.0.1"
 port = 7399
 [actions.work]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "work"
 node = "robot"
 [actions.recover]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "recover"
 node = "robot"
 """
@@ -54,6 +54,8 @@ def petrobot(
         "binary.toml": b"schema = 1\n\xff\xfe\n",
         "services.toml": CELL,
         "rates.toml": "[rates]\n",
+        "fails.toml": "schema = 1\n"
+        + "".join(f'[actions.{a}]\nstatus = "error"\ncause = "x"\n' for a in ("work", "recover")),
         "mock.toml": "schema = 1\n[actions.work]\nseconds = 1\n[[actions.recovre]]\nseconds = 1\n",
         "bell.toml": WORK + "\n[events.bell]\n",
         "bell_mock.toml": 'schema = 1\n[actions.work]\nevents = [{ name = "bell" }]\n',
@@ -286,7 +288,7 @@ def test_a_reader_that_leaves_is_no_answer(
     """`petrobot check TASK | head -1` must not end as if the task might not run."""
     if "kept.estimates" in words:
         learnt = ("--learn", "kept.estimates", "--selector", "fixed", "--quiet")
-        ran = ("run", "work.toml", "--mode", "lockstep", *learnt)
+        ran = ("run", "work.toml", "--mode", "lockstep", *learnt, "--mock", "fails.toml")
         petrobot(*ran)
     petrobot("convert", "work.toml", "work.pnml", "--view", "ordinary")
     reading, writing = os.pipe()

@@ -465,6 +465,18 @@ IN_THE_CODE: list[Mistake] = [
         "    if not settle(ctx):\n        return success()\n",
         r"arm_bot.py:\d+: `settle` does nothing without `await`; write `await settle",
     ),
+    (
+        CODE,
+        'ctx.command({"to": to})',
+        'ctx.command({"to": to}, until="arived")',
+        r"arm_bot.py:\d+: the state of Axis has no 'arived'.*mean 'arrived'.*returns arrived",
+    ),
+    (
+        CODE,
+        'await ctx.command({"to": to})',
+        'seen = await ctx.command({"to": to})\n    print(seen["a"])',
+        r"arm_bot.py:\d+: the state of Axis has no 'a'.*its `state` returns arrived, at",
+    ),
     (CODE, "import Context, Driver,", "import Contxt, Driver,", r":LINE: .*'Contxt'|cannot import"),
     (
         CODE,
@@ -613,7 +625,7 @@ IN_THE_CODE: list[Mistake] = [
         CODE,
         "return success()",
         "return success(True)",
-        r"arm_bot.py:\d+: `success\(True\)`: too many positional .*; write `success\(name=value\)`",
+        r"arm_bot.py:\d+: `success\(True\)`: its text is of type bool; write `success\(name",
     ),
     (
         CODE,
@@ -964,11 +976,19 @@ def _one_robot(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return the files of a robot without a mistake, as `petrobot new robot` writes them."""
+    """Return the files of a robot without a mistake, as `petrobot new robot` writes them, with a
+    driver that is written out."""
     folder = tmp_path_factory.mktemp("sound")
     with redirect_stdout(io.StringIO()):
         assert main(["new", "robot", "arm_bot", "--folder", str(folder)]) == 0
-    return {p.name: p.read_text(encoding="utf-8") for p in (folder / "arm_bot").iterdir()}
+    files = {p.name: p.read_text(encoding="utf-8") for p in (folder / "arm_bot").iterdir()}
+    files = {name: text.replace("Slide", "Axis") for name, text in files.items()}
+    files[TASK] = files[TASK].replace(
+        "move = { deadline = 8.0 }             # s",
+        'move = { deadline = 8.0, error_causes = { blocked = "something is in the way" } }',
+    )
+    longhand = Path(__file__).with_name("longhand.py").read_text(encoding="utf-8")
+    return files | {CODE: longhand}
 
 
 def said(*arguments: str) -> tuple[int, str]:
@@ -1137,7 +1157,9 @@ closed = { in = ["close:normal"], out = ["held"] }
         "",
     ),
 ]
-NO_BRANCH = r"arm_bot.toml:44: subnets.hold.places.close: no outgoing arc `error`"
+NO_PLACE = (TASK, 'error = "lost"\n', "", "")
+NOT_LOST = (TASK, 'lost = { in = ["grip:error"] }', "", "")
+NO_BRANCH = r"arm_bot.toml:43: subnets.hold.places.close: no outgoing arc `error`"
 USED = "await ctx.sleep(0.3)"
 DRIVES = ("command", "stop", "stopped")
 
@@ -1201,8 +1223,13 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         r"places.grip.args.p: expected a place, found the value of 'w'; write the name of a place",
         [(TASK, '{ var = "w" }', '"broken"', ""), (TASK, '{ var = "w" }', '"broken"', "")],
     ),
+    (  # `grip` holds the axis
+        [*SUBNET, NO_PLACE],
+        r"transitions.lost.in: 'grip' has no error exit; give subnets.hold an `error` place",
+        [(TASK, 'normal = "held"', 'normal = "held"\nerror = "lost"', "")],
+    ),
     (
-        SUBNET,
+        [*SUBNET, NO_PLACE, NOT_LOST],
         rf"{NO_BRANCH}[^|]*add to \[subnets.hold.transitions\] one with in = \[\"close:error\"\]",
         [
             (
@@ -1214,16 +1241,9 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         ],
     ),
     (
-        SUBNET,
-        rf"{NO_BRANCH}[^|]*\[subnets.hold.errors\] to = ",
-        [
-            (
-                TASK,
-                "[subnets.hold.places]",
-                '[subnets.hold.errors]\nto = "lost"\n[subnets.hold.places]',
-                "",
-            )
-        ],
+        [*SUBNET, NO_PLACE, NOT_LOST],
+        rf"{NO_BRANCH}[^|]*error = ... in \[subnets.hold\]",
+        [(TASK, 'normal = "held"', 'normal = "held"\nerror = "lost"', "")],
     ),
     (
         [

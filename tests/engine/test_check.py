@@ -557,5 +557,5 @@ def test_a_finding_about_a_subnet_is_told_once_and_one_about_a_use_at_its_macro_
     found = {(f.code, f.key): f.remedy for f in check(loads(NESTED)).findings}
     remedy = found.pop(("no-error-exit", "subnets.inner.places.work"))
     assert 'add to [subnets.inner.transitions] one with in = ["work:error"]' in remedy
-    assert "[subnets.inner.errors] to" in remedy
+    assert "error = ... in [subnets.inner]" in remedy
     assert [*found] == [("never-marked", "places.never.begin")]

@@ -332,9 +332,9 @@ class ArmPlay:
         self.run = "test"
         self.verdicts: list[tuple[str, Status, str]] = []
 
-    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+    def verdict(self, run: str, result: Result) -> None:
         """Keep it."""
-        self.verdicts.append((run, status, cause))
+        self.verdicts.append((run, result.status, result.cause))
 
     @property
     def now(self) -> float:

@@ -56,6 +56,56 @@ def door() -> Door:
     return Door({}, None)
 
 
+class Gate(Door):
+    """Opens in half a second."""
+
+    def step(self, now: float) -> None:
+        self.time = getattr(self, "time", 0.0) + self.period
+
+    def state(self) -> Mapping[str, Any]:
+        return {**super().state(), "open": getattr(self, "time", 0.0) > 0.5}
+
+
+async def pass_gate(ctx: Context[Remote], *, until: str) -> Result:
+    state = await ctx.command({"share": 0.5}, until=until)
+    return success("open", **state)
+
+
+@pytest.mark.parametrize(("until", "least", "most"), [("open", 0.48, 0.6), ("", 0.0, 0.06)])
+def test_a_command_waits_until_the_state_says_so(until: str, least: float, most: float) -> None:
+    played = rehearse(pass_gate, device=Gate({}, None), until=until)
+    assert least <= played.seconds <= most
+    assert played.result.values["open"] is bool(until) and played.result.text == "open"
+
+
+def test_a_command_that_is_refused_does_not_wait_for_the_state() -> None:
+    async def act(ctx: Context[Remote]) -> Result:
+        await ctx.command({"share": 3}, until="open")
+        return success()
+
+    ended = rehearse(act, device=Gate({}, None))
+    assert ended.result.cause == "command_refused" and ended.seconds < 0.1
+
+
+def test_a_command_that_waits_can_be_cancelled() -> None:
+    ended = rehearse(pass_gate, device=Gate({}, None), until="open", cancel_after=0.2)
+    assert ended.result.cause == "cancelled" and ended.seconds < 0.4
+
+
+def test_a_state_without_the_awaited_key_is_told_at_once() -> None:
+    ended = rehearse(pass_gate, device=Gate({}, None), until="opened")
+    assert ended.result.cause == "exception" and ended.seconds < 0.1
+    assert (
+        "until: the state of the driver has no 'opened'; it has 'share', 'op" in ended.result.text
+    )
+
+
+@pytest.mark.parametrize("value", [True, 3, ["a"], None])
+def test_a_value_of_a_success_needs_a_name(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"success: expected a text, found .*write success\(name=v"):
+        success(value)
+
+
 def test_an_accepted_command_has_reached_the_driver_when_the_action_continues() -> None:
     """The action then reads a state from after the command."""
     played = rehearse(open_door, device=door(), share=0.5)

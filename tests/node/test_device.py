@@ -110,6 +110,22 @@ def test_a_default_has_the_type_of_its_key() -> None:
             read_keys(Wrong, config)
 
 
+def test_a_value_in_a_derived_class_is_the_new_default_of_a_key() -> None:
+    class Fast(Scanner):
+        tries = 5
+
+    class Wrong(Scanner):
+        tries = "five"  # type: ignore[assignment]
+
+    assert read_keys(Fast, {"port": "a"})["tries"] == 5
+    assert read_keys(Fast, {"port": "a", "tries": 1})["tries"] == 1
+    with pytest.raises(ValueError, match="tries: expected a whole number, found 'many'"):
+        read_keys(Fast, {"port": "a", "tries": "many"})
+    with pytest.raises(ValueError, match=r"tries: .* found the default 'five' of its `key`"):
+        read_keys(Wrong, {"port": "a"})
+    assert read_keys(Scanner, {"port": "a"})["tries"] == 3
+
+
 def test_keys_of_ports_are_accepted() -> None:
     assert read_keys(Scanner, {"port": "a", "source": "sim", "bitrate": 1})["port"] == "a"
 

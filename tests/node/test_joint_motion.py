@@ -1,4 +1,4 @@
-"""Set points of joints, whatever they are told."""
+"""Set points of joints and of an axis, whatever they are told."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot import Driver, JointMotion
+from petrobot import Axis, Driver, JointMotion, check_driver
 
 LIMITS = {"lift": (-1.5, 1.5), "turn": (-3.0, 3.0)}
 DT = 0.02
@@ -147,3 +147,154 @@ def test_without_speed_or_acceleration_it_would_never_move(
 ) -> None:
     with pytest.raises(ValueError, match="speed and acceleration above 0"):
         JointMotion(Bare({}, None), LIMITS, speed, acceleration)
+
+
+class Lift(Axis):
+    """An axis with two stations; `blocked` for as long as a door is open."""
+
+    period = DT
+    obeys = (*Axis.obeys, "dry_run")
+    along = "z"
+    stations = {"low": 0.2, "high": 1.2}  # noqa: RUF012 - as its users write it
+    top_speed = 0.8
+    acceleration = 2.0
+    blocked = False
+
+    def step(self, now: float) -> None:
+        self.allowed = 0.0 if self.blocked else 0.8
+        super().step(now)
+
+
+def moves(lift: Axis, most: int = 1000) -> list[float]:
+    """Step until it stands; where it was."""
+    seen = [lift.at]
+    for _ in range(most):
+        lift.step(0.0)
+        seen.append(lift.at)
+        if lift.stopped():
+            return seen
+    raise AssertionError(f"still moving after {most} steps")
+
+
+def test_an_axis_keeps_the_rules_of_drivers() -> None:
+    commands: list[dict[str, Any]] = [{"to": "high"}, {"to": 0.3, "speed": 0.8}]
+    assert check_driver(Lift, commands, simulated=True).faults == []
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(st.floats(0.2, 1.2), min_size=1, max_size=3),
+    st.floats(0.1, 1.0),
+    st.integers(1, 60),
+    st.sampled_from(["stop", "pause", "block", "turn"]),
+)
+def test_an_axis_keeps_speed_acceleration_and_ends(
+    goals: list[float], speed: float, steps: int, happens: str
+) -> None:
+    lift = Lift({"speed": speed}, None)
+    seen = [lift.at, lift.at]
+    for goal in goals:  # the next one comes while it moves
+        lift.command(0.0, {"to": goal})
+        for step in range(steps):
+            lift.paused = happens == "pause" and step % 7 < 3
+            lift.blocked = happens == "block" and step % 7 < 3
+            lift.step(0.0)
+            seen.append(lift.at)
+        if happens == "stop":
+            lift.stop(0.0)
+    lift.paused = lift.blocked = False
+    seen += [*moves(lift)[1:], lift.at]
+    rates = [(b - a) / DT for a, b in pairwise(seen)]
+    assert max(map(abs, rates)) <= 0.8 * speed + 1e-6
+    assert all(abs(b - a) <= 2.0 * DT + 1e-6 for a, b in pairwise(rates))
+    assert all(0.2 - 1e-9 <= at <= 1.2 + 1e-9 for at in seen)
+    arrived = lift.state()["arrived"]
+    assert lift.velocity == 0.0 and arrived is (happens != "stop")
+    if arrived:
+        assert lift.at == goals[-1]
+
+
+def test_an_axis_takes_as_long_as_its_trapezoid() -> None:
+    lift = Lift({}, None)
+    lift.command(0.0, {"to": "high"})
+    assert len(moves(lift)) * DT == pytest.approx(1.0 / 0.8 + 0.8 / 2.0, abs=0.06)
+
+
+def test_an_axis_begins_at_0_or_at_the_end_next_to_it() -> None:
+    assert Lift({}, None).at == 0.2 and Lift({"ends": [-1.0, 2.0]}, None).at == 0.0
+
+
+def test_an_axis_stands_still_while_it_is_paused_or_blocked() -> None:
+    lift = Lift({}, None)
+    lift.command(0.0, {"to": "high"})
+    assert not lift.stopped()  # it is about to move
+    lift.blocked = True
+    for _ in range(5):
+        lift.step(0.0)
+    assert lift.at == 0.2 and lift.velocity == 0.0
+    lift.hold(0.0)
+    assert lift.stopped()
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"to": "hihg"}, "to: 'hihg' is none of low, high"),
+        ({"to": 1.3}, "to: expected 0.2 to 1.2 m, found 1.3"),
+        ({"to": 1.1}, "to: the point x = 0.000, y = 0.000, z = 1.100 m lies outside"),
+        ({"to": math.nan}, r"to: expected 1 finite numbers, found \[nan\]"),
+        ({"to": True}, "to: expected 1 finite numbers"),
+        ({"to": None}, "to: expected 1 finite numbers"),
+        ({"to": "low", "speed": 0.0}, "speed: expected a share above 0 and at most 1, found 0"),
+        ({"to": "low", "fast": True}, r"command: unknown keys \['fast'\]; expected \['to'\], opti"),
+        ({}, r"command: is missing \['to'\]"),
+    ],
+)
+def test_what_an_axis_refuses_leaves_it_where_it_is(body: dict[str, Any], words: str) -> None:
+    lift = Lift({"workspace": {"z": [0.0, 1.0]}}, None)
+    with pytest.raises(ValueError, match=words):
+        lift.command(0.0, body)
+    assert lift.goal is None and lift.stopped()
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        (
+            {"stations": {}},
+            r"ends: is missing; give \[least, greatest\] position in m, or stations",
+        ),
+        ({"ends": [1.2, 0.2]}, r"ends: expected \[least, greatest\] position, found \[1.2, 0.2\]"),
+        ({"ends": [0.0]}, "ends: expected 2 finite numbers"),
+        ({"ends": [0.0, 1.0]}, r"stations: high lies beyond the ends \[0.0, 1.0\] m"),
+        ({"stations": {"low": "0.2"}}, "stations.low: expected 1 finite numbers, found"),
+        ({"top_speed": 0.0}, "top_speed, acceleration: expected numbers above 0, found 0 and 2"),
+        (
+            {"acceleration": -1},
+            "top_speed, acceleration: expected numbers above 0, found 0.8 and -1",
+        ),
+        ({"top_sped": 1.0}, "top_sped: .*top_speed"),
+    ],
+)
+def test_keys_of_an_axis_that_make_no_sense_are_refused(keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Lift(keys, None)
+
+
+def test_an_axis_without_stations_moves_between_its_ends() -> None:
+    class Rail(Axis):
+        ends = [0.0, 1.0]  # noqa: RUF012 - as its users write it
+
+    rail = Rail({}, None)
+    with pytest.raises(ValueError, match="to: 'left' is none of its stations: it has none; give"):
+        rail.command(0.0, {"to": "left"})
+    rail.command(0.0, {"to": 0.5})
+    assert moves(rail)[-1] == 0.5
+
+
+def test_an_axis_must_lie_along_x_y_or_z() -> None:
+    class Up(Lift):
+        along = "up"
+
+    with pytest.raises(ValueError, match="along: expected x, y or z in the driver, found 'up'"):
+        Up({}, None)

@@ -97,10 +97,10 @@ def test_a_rehearsal_reports_everything_that_an_action_did() -> None:
 def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
     async def act(ctx: Context, run: str) -> Result:
         await ctx.sleep(0.1)
-        ctx.verdict(run, Status.FAILURE, "crooked")
+        ctx.verdict(run, failure("crooked"))
         with pytest.raises(ValueError, match=r"pass ctx\.run of the run's own context"):
-            ctx.verdict("pick#1", Status.FAILURE)
-        with pytest.raises(ValueError, match="good"):
+            ctx.verdict("pick#1", failure("crooked"))
+        with pytest.raises(TypeError, match=r"expected a result, such as .* found 'good'"):
             ctx.verdict(run, "good")  # type: ignore[arg-type]
         return provisional(failure("loose", "may hold", force=1.0))
 
@@ -118,7 +118,7 @@ def test_the_run_of_one_rehearsal_can_be_judged_in_another() -> None:
         return provisional(success(run=ctx.run))
 
     async def judge(ctx: Context, run: str) -> Result:
-        ctx.verdict(run, Status.FAILURE, "crooked")
+        ctx.verdict(run, failure("crooked"))
         return success()
 
     picked = rehearse(pick).result.values["run"]

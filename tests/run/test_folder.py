@@ -20,15 +20,15 @@ schema = 1
 host = "127.0.0.1"
 port = 7399
 [actions.left_fetch]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "fetch"
 node = "robot"
 [actions.right_carry]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "carry"
 node = "robot"
 [actions.right_tidy]
-run = "petrobot.services.action:success"
+run = "petrobot.services.scripted:nothing"
 task = "tidy"
 node = "robot"
 [timers.bell]

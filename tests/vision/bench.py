@@ -231,8 +231,8 @@ class BenchContext:
     def raise_event(self, name: str, **data: Any) -> None:
         raise AssertionError("vision raises no events")
 
-    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
-        self.verdicts.append((run, status, cause))
+    def verdict(self, run: str, result: Result) -> None:
+        self.verdicts.append((run, result.status, result.cause))
 
     def progress(self, fraction: float, **data: Any) -> None:
         assert 0.0 <= fraction <= 1.0
@@ -242,7 +242,9 @@ class BenchContext:
     ) -> Result:
         raise AssertionError("vision calls no service")
 
-    async def command(self, body: Mapping[str, Any], timeout: float = 1.0) -> None:
+    async def command(
+        self, body: Mapping[str, Any], timeout: float = 1.0, *, until: str = ""
+    ) -> Mapping[str, Any]:
         raise NotImplementedError
 
     async def get_versioned(self, name: str, default: Any = None) -> tuple[Any, int]:

@@ -104,7 +104,8 @@ def _in_subnet(task: Task, uses: Mapping[str, str], finding: Finding) -> Finding
 
     def local(text: str) -> str:
         text = re.sub(rf"(?<![\w.]){re.escape(prefix)}", "", text)
-        return re.sub(r"\[(errors|transitions)\]", rf"[subnets.{subnet}.\1]", text)
+        text = text.replace("[errors] to = ...", f"error = ... in [subnets.{subnet}]")
+        return text.replace("[transitions]", f"[subnets.{subnet}.transitions]")
 
     return replace(
         finding,

@@ -296,7 +296,7 @@ def broken(ctx: Context) -> Result:
 
 def judge(ctx: Context, *, run: str) -> Result:
     """Send a verdict on an earlier run."""
-    ctx.verdict(run, Status.FAILURE, "crooked")
+    ctx.verdict(run, failure("crooked"))
     return success()
 
 

@@ -166,9 +166,9 @@ SAYS: Mapping[str, Callable[[Context], Any]] = {
     "progress in words": lambda ctx: ctx.progress("half"),  # type: ignore[arg-type]
     "a long set point": lambda ctx: ctx.publish("points", [0.0] * 100_000),
     "a set point that is no number": lambda ctx: ctx.publish("points", [float("inf")]),
-    "a verdict with a long cause": lambda ctx: ctx.verdict("m/p#1", Status.FAILURE, "x" * 300),
-    "a verdict with half a letter": lambda ctx: ctx.verdict("m/p#1", Status.FAILURE, "x", "\ud800"),
-    "a verdict on much": lambda ctx: ctx.verdict("m" * 250 + "/p#1", Status.FAILURE),
+    "a verdict with a long cause": lambda ctx: ctx.verdict("m/p#1", failure("x" * 300)),
+    "a verdict with half a letter": lambda ctx: ctx.verdict("m/p#1", failure("x", "\ud800")),
+    "a verdict on much": lambda ctx: ctx.verdict("m" * 250 + "/p#1", failure("x")),
 }
 """Events and progress that it sends; each must end its run as `exception`."""
 ASKS: Mapping[str, Callable[[Context], Any]] = {

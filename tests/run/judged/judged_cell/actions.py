@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from petrobot.services.action import Context, Result, Status, provisional, success
+from petrobot.services.action import Context, Result, failure, provisional, success
 
 
 def number(run: str) -> int:
@@ -26,13 +26,11 @@ async def inspect(ctx: Context, *, run: str) -> Result:
     third and sixth cannot be seen."""
     await ctx.sleep(0.05)
     if number(run) in (1, 4):
-        ctx.verdict(run, Status.FAILURE, "crooked", "held by a corner")
+        ctx.verdict(run, failure("crooked", "held by a corner"))
     if number(run) in (1, 2, 5):
-        ctx.verdict(run, Status.SUCCESS)
+        ctx.verdict(run, success())
     if number(run) == 5:
-        ctx.verdict(
-            run.replace("pick", "inspect"), Status.FAILURE, "sure"
-        )  # a run that was never provisional
+        ctx.verdict(run.replace("pick", "inspect"), failure("sure"))  # it was never provisional
     return success()
 
 
