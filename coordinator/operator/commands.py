@@ -89,6 +89,7 @@ class Operation:
         self.feed = shown.publisher.feed if shown is not None else feed or Feed()
         self.controls = controls or Controls(self.feed)
         self._refusals: list[str] = []
+        self._closed = False
         self._unanswered: set[asyncio.Future[Answer]] = set()
         """Answers that wait until their commands are journaled."""
         self._holding: dict[str, str] = {}
@@ -124,8 +125,12 @@ class Operation:
     async def close(self) -> None:
         """Stop asking the nodes."""
         self.feed.clock = None
+        self._closed = True
         for answer in tuple(self._unanswered):
-            answer.set_result(refusal("journal", "the run ended before this was in its journal"))
+            if not answer.done():
+                answer.set_result(
+                    refusal("journal", "the run ended before this was in its journal")
+                )
         if self._stopping is not None:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
@@ -265,7 +270,7 @@ class Operation:
 
     async def _do_remark(self, who: str, data: Mapping[str, Any]) -> Answer:
         store, now = self.executor.store, self.shell.now()
-        if self.mission.stage is Stage.OVER:
+        if self.mission.stage is Stage.OVER or self._closed:
             return refusal("idle", "the mission run has finished")
         if not isinstance(store, JournalStore):
             return refusal(
@@ -313,6 +318,8 @@ class Operation:
 
     def _refused(self, stimulus: Stimulus) -> Answer | None:
         early = self.mission.stage in _BEFORE and isinstance(stimulus, _MAY_COME_EARLY)
+        if self._closed:
+            return refusal("idle", "the mission run has ended")
         if self.mission.stage is not Stage.RUNNING and not early:
             return refusal("idle", f"the mission run is {self.mission.stage.value}")
         try:

@@ -201,6 +201,12 @@ class Executor:
         (effects, then), self._syncing = self._syncing, None
         for call in then:
             call(now)
+        # What was stopped or held before it began must not move for as long as another sync takes.
+        held = {e.run for e in self._effects if isinstance(e, CancelRun | HoldRun)}
+        held &= {e.run for e in effects if isinstance(e, StartRun)}
+        behind = [e for e in effects if isinstance(e, _Order) and e.run in held]
+        self._effects[:0] = behind
+        effects = [e for e in effects if e not in behind]
         self._let_leave(now, effects)
         self._work(now)
 
@@ -222,8 +228,9 @@ class Executor:
 
     def _let_leave(self, now: float, effects: Iterable[Instruction]) -> None:
         for instruction in effects:
-            if isinstance(instruction, CancelRun) and instruction.run not in self.state.stopping:
-                continue  # it ended in the same turn
+            stopping = isinstance(instruction, _Order) and instruction.run in self.state.stopping
+            if isinstance(instruction, StartRun if stopping else CancelRun):
+                continue  # it was stopped before it began, or ended in the same turn
             self._queue.extend(self.dispatch.carry_out(now, instruction))
 
     def _safe_effects(self, now: float) -> list[Instruction]:
