@@ -302,6 +302,17 @@ def test_a_held_run_is_not_given_up_even_in_a_long_pause() -> None:
     assert bench.records[0].cause == "no_answer"
 
 
+def test_a_run_whose_hold_is_answered_after_the_pause_is_given_up() -> None:
+    bench = Bench().begin()
+    bench.executor.stimulate(1.0, Pause())
+    bench.executor.stimulate(1.0, Resume())
+    hold, _ = bench.sent(m.Command)
+    assert isinstance(hold, m.Command)
+    bench.say(1.1, m.Answer(hold.id, True, {"answers": {"arm": Hold.HELD.value}}))
+    bench.go(100.0)
+    assert bench.records and bench.records[0].cause == "no_answer"
+
+
 # --- cost -------------------------------------------------------------------------------------
 
 
