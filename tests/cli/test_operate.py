@@ -182,6 +182,21 @@ async def test_a_command_is_answered_when_the_run_ends_before_its_disk_has_writt
     assert not petrobot.arm.moving
 
 
+async def test_an_emergency_stop_is_answered_before_a_slow_disk(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on = threading.Event()
+    await petrobot.working()
+    monkeypatch.setattr(os, "fdatasync", lambda _: goes_on.wait(PATIENCE_S))
+    try:
+        said = await petrobot.operation.command("ana", "estop", {})
+        assert not said["ok"] and said["text"].startswith("the nodes were told to stop; the disk")
+        await until(lambda: not petrobot.arm.moving)
+    finally:
+        goes_on.set()
+    await asyncio.wait_for(petrobot.running, PATIENCE_S)
+
+
 async def test_a_disk_that_never_answers_ends_the_run_and_holds_nobody(
     petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
