@@ -345,7 +345,7 @@ class Operation:
         await asyncio.wait({journaled}, timeout=STOP_ANSWER)
         if not journaled.done():
             return refusal(
-                "journal", "the nodes were told to stop; the disk of the journal is slow to store it"
+                "journal", "the nodes were told to stop; the journal's disk is slow to store it"
             )
         answer = journaled.result()
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
