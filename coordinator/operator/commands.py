@@ -51,6 +51,8 @@ _log = logging.getLogger(__package__)
 
 ANSWERS = 1.5
 """Time for nodes to answer a pause (s)."""
+STOP_ANSWER = 0.5
+"""Longest wait of an emergency stop for the journal's disk (s): `petrobot estop` waits for 1 s."""
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
 """Commands that only configure the run and move nothing."""
@@ -89,6 +91,7 @@ class Operation(Followed):
         self.feed = shown.publisher.feed if shown is not None else feed or Feed()
         self.controls = controls or Controls(self.feed)
         self._refusals: list[str] = []
+        self._closed = False
         self._unanswered: set[asyncio.Future[Answer]] = set()
         """Answers that wait until their commands are journaled."""
         self._holding: dict[str, str] = {}
@@ -124,8 +127,12 @@ class Operation(Followed):
     async def close(self) -> None:
         """Stop asking the nodes."""
         self.feed.clock = None
+        self._closed = True
         for answer in tuple(self._unanswered):
-            answer.set_result(refusal("journal", "the run ended before this was in its journal"))
+            if not answer.done():
+                answer.set_result(
+                    refusal("journal", "the run ended before this was in its journal")
+                )
         if self._stopping is not None:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
@@ -257,7 +264,7 @@ class Operation(Followed):
 
     async def _do_remark(self, who: str, data: Mapping[str, Any]) -> Answer:
         store, now = self.executor.store, self.shell.now()
-        if self.mission.stage is Stage.OVER:
+        if self.mission.stage is Stage.OVER or self._closed:
             return refusal("idle", "the mission run has finished")
         if not isinstance(store, JournalStore):
             return refusal(
@@ -305,6 +312,8 @@ class Operation(Followed):
 
     def _refused(self, stimulus: Stimulus) -> Answer | None:
         early = self.mission.stage in _BEFORE and isinstance(stimulus, _MAY_COME_EARLY)
+        if self._closed:
+            return refusal("idle", "the mission run has ended")
         if self.mission.stage is not Stage.RUNNING and not early:
             return refusal("idle", f"the mission run is {self.mission.stage.value}")
         try:
@@ -325,7 +334,12 @@ class Operation(Followed):
         )
         if self._live and (self._stopping is None or self._stopping.done()):
             self._stopping = asyncio.get_running_loop().create_task(self._stop_again())
-        answer = await journaled
+        await asyncio.wait({journaled}, timeout=STOP_ANSWER)
+        if not journaled.done():
+            return refusal(
+                "journal", "the nodes were told to stop; the journal's disk is slow to store it"
+            )
+        answer = journaled.result()
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
 
     async def _stop_again(self) -> None:

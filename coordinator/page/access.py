@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from aiohttp import web
 from aiohttp.typedefs import Middleware
 
+from petrobot.services.comm.calls.link import allowed
+
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 HEADERS = {
@@ -162,20 +164,25 @@ class ConnectionLimit:
     """A protocol factory around aiohttp's that counts and times connections."""
 
     def __init__(
-        self, server: web.Server, limit: int = CONNECTIONS, silent: float = SILENT_S
+        self, server: web.Server, limit: int | None = None, silent: float = SILENT_S
     ) -> None:
+        """`limit`: `CONNECTIONS`, or fewer if the process may open few files."""
         self._server = server
-        self._limit = limit
+        self.limit = allowed(CONNECTIONS, 4) if limit is None else limit
         self.silent = silent
-        self._waiting: set[asyncio.BaseProtocol] = set()
+        self._waiting: dict[web.RequestHandler, None] = {}
+        """Connections that have asked for nothing yet, the oldest first."""
         self._coming = 0
 
     def __call__(self) -> asyncio.Protocol:
-        """Return the protocol of a new connection."""
-        if self.open_connections >= self._limit:
-            return _Refused()
+        """Return the protocol of a new connection. Above the limit it takes the place of the oldest
+        one that has asked for nothing yet."""
+        if self.open_connections >= self.limit:
+            if not self._waiting:
+                return _Refused()
+            self._end_if_silent(next(iter(self._waiting)))
         handler = self._server()
-        self._waiting.add(handler)
+        self._waiting[handler] = None
         self._coming += 1  # aiohttp counts it one iteration of the event loop later.
         loop = asyncio.get_running_loop()
         loop.call_soon(self._came)
@@ -192,11 +199,11 @@ class ConnectionLimit:
 
     def asked(self, request: web.Request) -> None:
         """Note that a connection has sent a complete request header."""
-        self._waiting.discard(request.protocol)
+        self._waiting.pop(request.protocol, None)
 
     def _end_if_silent(self, handler: web.RequestHandler) -> None:
         if handler not in self._waiting:
             return
-        self._waiting.discard(handler)
+        del self._waiting[handler]
         if handler.transport is not None:
             handler.force_close()

@@ -112,8 +112,9 @@ async def start_page(
     assert runner.server is not None
     page_state.limit = ConnectionLimit(runner.server)
     listening = await asyncio.get_running_loop().create_server(
-        page_state.limit, sock=listener, backlog=128
+        page_state.limit, sock=listener, backlog=max(1, page_state.limit.limit // 4)
     )
+    listener.listen(128)  # asyncio accepts `backlog` connections at once: few, of a long queue
     url = f"http://{HOST}:{number}/?token={access.token}"
     return Page(runner, listening, page_state, url)
 

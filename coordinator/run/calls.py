@@ -329,6 +329,8 @@ class Dispatch:
 
     def _release(self, now: float, release: ReleaseRun) -> list[Stimulus]:
         flight = self.flights.get(release.run)
+        # The answer to a hold that comes after its release holds nothing any more.
+        self._commands = {key: run for key, run in self._commands.items() if run != release.run}
         if flight is not None:
             self.callers[flight.node].release(now, self.call_id(release.run))
         return self._command(now, release.run, "release")

@@ -198,7 +198,12 @@ class Executor:
         """The sync that `in_background` was given has ended: let leave what waited for it."""
         assert self._syncing is not None
         (effects, then), self._syncing = self._syncing, None
-        self._let_leave(now, effects)
+        # What was stopped or held before it began must not move for as long as another sync takes.
+        held = {e.run for e in self._effects if isinstance(e, CancelRun | HoldRun)}
+        held &= {e.run for e in effects if isinstance(e, StartRun)}
+        behind = [e for e in effects if isinstance(e, _Order) and e.run in held]
+        self._effects[:0] = behind
+        self._let_leave(now, [e for e in effects if e not in behind])
         for call in then:
             call(now)
         self._work(now)
@@ -221,8 +226,9 @@ class Executor:
 
     def _let_leave(self, now: float, effects: Iterable[Instruction]) -> None:
         for instruction in effects:
-            if isinstance(instruction, CancelRun) and instruction.run not in self.state.stopping:
-                continue  # it ended in the same turn
+            stopping = isinstance(instruction, _Order) and instruction.run in self.state.stopping
+            if isinstance(instruction, StartRun if stopping else CancelRun):
+                continue  # it was stopped before it began, or ended in the same turn
             self._queue.extend(self.dispatch.carry_out(now, instruction))
 
     def _safe_effects(self, now: float) -> list[Instruction]:

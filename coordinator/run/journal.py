@@ -25,6 +25,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import msgpack
@@ -80,6 +81,7 @@ class JournalWriter:
         durable."""
         self._torn: int | None = None
         """Where to cut the file before anything is appended; None: nowhere."""
+        self._syncing = Lock()
         self.syncs = 0
         if header is not None:
             try:
@@ -213,18 +215,22 @@ class JournalWriter:
         return partial(self._sync, self._written)
 
     def _sync(self, written: int) -> None:
-        if self._durable < written:
-            try:
-                os.fdatasync(self._file)
-            except OSError as fault:
-                raise JournalError(
-                    f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
-                ) from fault
-            self.syncs += 1
-            self._durable = max(self._durable, written)
+        with self._syncing:
+            if self._durable < written:
+                try:
+                    os.fdatasync(self._file)
+                except OSError as fault:
+                    raise JournalError(
+                        f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
+                    ) from fault
+                self.syncs += 1
+                self._durable = max(self._durable, written)
 
     def close(self) -> None:
-        """Sync and close; the file is closed even if the sync fails."""
+        """Sync and close; the file is closed even if the sync fails. If the disk does not answer
+        another thread's sync, it would not answer this one: the file stays open, and locked."""
+        if self._syncing.locked():
+            return
         try:
             self.sync()
         finally:

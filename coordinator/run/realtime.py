@@ -9,12 +9,14 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from shlex import quote
+from threading import Thread
 from typing import Final
 
+from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import KEY_CODES, Client
@@ -89,6 +91,8 @@ class Punctuality:
 
 SLOW_DISK: Final = 0.3
 """From this duration of a sync on the result says that the disk is slow (s)."""
+DISK_PATIENCE: Final = 60.0
+"""From this duration of a sync on the run ends: the disk does not answer (s)."""
 LINGER = 1.0
 """Longest wait for anything at the end of a run (s)."""
 ASK_AGAIN: Final = 0.2
@@ -146,7 +150,6 @@ class RealtimeMission:
         self._lost_at: dict[str, float] = {}
         self._punctuality = Punctuality()
         self._looking: asyncio.TimerHandle | None = None
-        self._disk = ThreadPoolExecutor(1, "journal")
         self._syncing: asyncio.Future[None] | None = None
         self._slowest_sync = 0.0
         """Longest time that a sync took (s)."""
@@ -310,8 +313,7 @@ class RealtimeMission:
             if timer is not None:
                 timer.cancel()
         if self._syncing is not None:
-            await asyncio.wait({self._syncing})
-        self._disk.shutdown()
+            await asyncio.wait({self._syncing}, timeout=LEAVE)
         await asyncio.gather(*(self._leave(name, client) for name, client in self.clients.items()))
 
     async def _leave(self, name: str, client: Client) -> None:
@@ -349,13 +351,32 @@ class RealtimeMission:
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
 
     def _sync(self, work: Callable[[], None]) -> None:
-        """Make the journal durable in a thread."""
-        self._syncing = self._loop.run_in_executor(self._disk, work)
-        self._syncing.add_done_callback(partial(self._synced, self.now()))
+        """Make the journal durable in a thread. It ends with the process, not the other way: the
+        disk may never answer."""
+        began, done = self.now(), self._loop.create_future()
+        text = f"the disk of the journal has not answered for {DISK_PATIENCE:g} s"
+        patience = self._loop.call_at(began + DISK_PATIENCE, self.fail, JournalError(text))
 
-    def _synced(self, began: float, done: asyncio.Future[None]) -> None:
+        def end(fault: Exception | None) -> None:
+            patience.cancel()
+            done.set_result(None)
+            self._synced(began, fault)
+
+        def sync() -> None:
+            fault = None
+            try:
+                work()
+            except Exception as found:
+                fault = found
+            with suppress(RuntimeError):  # the loop was closed, because this took so long
+                self._loop.call_soon_threadsafe(end, fault)
+
+        self._syncing = done
+        Thread(target=sync, name="journal", daemon=True).start()
+
+    def _synced(self, began: float, fault: Exception | None) -> None:
         self._slowest_sync = max(self._slowest_sync, self.now() - began)
-        if (fault := done.exception()) is not None:
+        if fault is not None:
             self.fail(fault)
         elif not self._closed and self._fault is None:
             self._guarded(self.mission.synced)

@@ -752,6 +752,7 @@ class WorkerHost:
             for run_id, run in list(self._runs.items()):
                 self._stop(now, run, Cancel(run_id, stopped_by(verb)))
         elif verb == "release":
+            self._forget_holds()
             self._freeze(False)
         elif verb == "hold" and target is None and not self._setup.device:
             self._freeze(True)  # it holds as soon as it is ready, before its runs begin
@@ -804,8 +805,11 @@ class WorkerHost:
         elif unread and self._worker is not None:
             # A process that computes reads a hold only after its run. Then this is behind it.
             self._worker.post(RELEASE)
-        for id_ in unread:
-            self._commands[id_] = ""  # its answer holds nothing any more
+        self._forget_holds()
+
+    def _forget_holds(self) -> None:
+        """The answer to a hold that comes after its release holds nothing any more."""
+        self._commands = {i: "" if verb == "hold" else verb for i, verb in self._commands.items()}
 
     def _answered(self, answer: Answer) -> None:
         """Handle a process's answer to a command."""

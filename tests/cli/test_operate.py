@@ -25,9 +25,10 @@ from petrobot.coordinator.operator.run_address import (
     published,
 )
 from petrobot.coordinator.page import app_state
+from petrobot.coordinator.run import realtime
 from petrobot.coordinator.run.folder import JOURNAL, NoRunError
 from petrobot.coordinator.run.journal import JournalError, JournalWriter, read_journal
-from petrobot.coordinator.run.recording import remarks
+from petrobot.coordinator.run.recording import JournalStore, remarks
 from petrobot.services.comm.location_file import load
 from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
@@ -179,6 +180,46 @@ async def test_a_command_is_answered_when_the_run_ends_before_its_disk_has_writt
     said = await raising
     assert said.code == 1 and "ended before this was in its journal" in said.err, said
     assert not petrobot.arm.moving
+
+
+async def test_an_emergency_stop_is_answered_before_a_slow_disk(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on = threading.Event()
+    await petrobot.working()
+    monkeypatch.setattr(os, "fdatasync", lambda _: goes_on.wait(PATIENCE_S))
+    try:
+        said = await petrobot.operation.command("ana", "estop", {})
+        assert not said["ok"] and said["text"].startswith("the nodes were told to stop")
+        await until(lambda: not petrobot.arm.moving)
+    finally:
+        goes_on.set()
+    await asyncio.wait_for(petrobot.running, PATIENCE_S)
+
+
+async def test_a_disk_that_never_answers_ends_the_run_and_holds_nobody(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the end of the run nor a later command waits for the disk."""
+    goes_on = threading.Event()
+    monkeypatch.setattr(os, "fdatasync", lambda _: goes_on.wait(PATIENCE_S))
+    monkeypatch.setattr(realtime, "DISK_PATIENCE", 0.5)
+    try:
+        raising = asyncio.create_task(petrobot("raise", "part_there"))
+        with pytest.raises(JournalError, match="disk of the journal has not answered for"):
+            await asyncio.wait_for(petrobot.running, PATIENCE_S)
+        await petrobot.operation.close()
+        assert "ended before this was in its journal" in (await raising).err
+        for command in (["pause"], ["remark", "too late"]):
+            assert "the mission run has" in (await petrobot(*command)).err
+        async with asyncio.timeout(PATIENCE_S / 2):
+            await petrobot.shell.close()
+        store = petrobot.mission.executor.store
+        assert isinstance(store, JournalStore)
+        store.writer.close()
+        assert not petrobot.arm.moving and not goes_on.is_set()
+    finally:
+        goes_on.set()
 
 
 async def test_a_node_without_active_runs_is_idle_in_a_pause(petrobot: Terminal) -> None:

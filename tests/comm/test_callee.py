@@ -515,6 +515,22 @@ def test_the_deadline_of_a_run_that_began_after_the_hold_counts() -> None:
     assert callee.orders() == [m.Cancel("2", "deadline")]
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_a_run_that_was_released_before_its_hold_was_answered_is_not_held(again: bool) -> None:
+    """Pause, continue and, `again`, pause come together; the answers follow."""
+    callee = _callee(COORD)
+    callee.receive(0.0, "coord", m.Call("1", "move", {}, 2.0, 3))
+    callee.receive(0.5, "coord", m.Command("h1", "hold", "arm"))
+    callee.receive(0.5, "coord", m.Command("r", "release", "arm"))
+    if again:
+        callee.receive(0.5, "coord", m.Command("h2", "hold", "arm"))
+    for hold in ("h1", "h2") if again else ("h1",):
+        callee.answer(1.0, hold, True, {"answers": {"arm": "held"}})
+    callee.orders()
+    callee.advance(2.0)
+    assert callee.orders() == ([] if again else [m.Cancel("1", "deadline")])
+
+
 def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
     """A pause does not let a run continue without its caller."""
     callee = _callee(COORD)

@@ -358,6 +358,17 @@ def test_hold_reaches_device_and_runs() -> None:
     assert not [o for o in actions.orders() if isinstance(o, Cancel)]
 
 
+def test_a_hold_that_is_answered_after_its_release_holds_nothing() -> None:
+    """Pause and continue reach the node together: before, the run stood still for ever."""
+    bench = Bench()
+    driver, actions = bench.cyclic()
+    bench.begin()
+    bench.place.command(bench.clock.now, Command("h", "hold"))
+    bench.place.command(bench.clock.now, Command("r", "release"))
+    driver.say(answer_of("h", "held", {}))
+    assert HOLD not in actions.orders()
+
+
 @pytest.mark.parametrize("kind", ["cyclic", "one process"])
 def test_a_hold_ends_with_its_run_even_if_it_was_not_read_before(kind: str) -> None:
     bench = Bench()

@@ -247,6 +247,23 @@ async def test_a_thousand_sockets_do_not_block_the_operator(page: Page) -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
+async def test_an_operator_takes_the_place_of_a_connection_that_asks_for_nothing(
+    page: Page,
+) -> None:
+    """Before, whoever came first kept all places until the time of silent ones was over."""
+    page.limit.limit, page.limit.silent = 8, 600.0
+    crowd = [socket.create_connection(("127.0.0.1", port_of(page))) for _ in range(100)]
+    try:
+        async with asyncio.timeout(60), aiohttp.ClientSession(headers=bearer(page)) as http:
+            while True:
+                with contextlib.suppress(aiohttp.ClientConnectionError):
+                    assert (await http.get(base(page) + "/api/snapshot")).status == 200
+                    break
+    finally:
+        for one in crowd:
+            one.close()
+
+
 async def test_silent_connections_are_closed(page: Page) -> None:
     """A request header sent slowly and in part does not keep its connection for ever
     (slow-loris)."""

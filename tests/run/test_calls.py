@@ -302,6 +302,17 @@ def test_a_held_run_is_not_given_up_even_in_a_long_pause() -> None:
     assert bench.records[0].cause == "no_answer"
 
 
+def test_a_run_whose_hold_is_answered_after_the_pause_is_given_up() -> None:
+    bench = Bench().begin()
+    bench.executor.stimulate(1.0, Pause())
+    bench.executor.stimulate(1.0, Resume())
+    hold, _ = bench.sent(m.Command)
+    assert isinstance(hold, m.Command)
+    bench.say(1.1, m.Answer(hold.id, True, {"answers": {"arm": Hold.HELD.value}}))
+    bench.go(100.0)
+    assert bench.records and bench.records[0].cause == "no_answer"
+
+
 # --- cost -------------------------------------------------------------------------------------
 
 
@@ -363,35 +374,55 @@ def test_after_a_sync_that_was_asked_for_none_is_due(tmp_path: Path) -> None:
     assert store.safe and (due is None or due > 0.7)
 
 
-def test_what_comes_while_the_disk_is_slow_waits_for_the_next_sync(tmp_path: Path) -> None:
-    """The bell rings while the start of `work` is not yet on disk: start, then stop."""
-    syncs: list[Callable[[], None]] = []
-    bench = Bench(store=JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0))
-    bench.executor.in_background = syncs.append
+class SlowDisk:
+    """A bench that has begun; its disk writes when the test says so."""
 
-    def disk_has_written(now: float) -> list[Message]:
-        (sync,) = syncs
-        syncs.clear()
+    def __init__(self, folder: Path) -> None:
+        self.bench = Bench(store=JournalStore(JournalWriter(folder / "run.journal", {}), 0.0))
+        self._syncs: list[Callable[[], None]] = []
+        self.bench.executor.in_background = self._syncs.append
+        self.bench.link(0.0)
+        self.bench.sent()
+        self.bench.executor.stimulate(0.0, Begin())
+
+    def writes(self, now: float) -> list[Message]:
+        """End the sync, and return what leaves then."""
+        (sync,) = self._syncs
+        self._syncs.clear()
         sync()
-        bench.executor.synced(now)
-        return bench.sent(m.Call, m.Cancel, m.EventAck, m.ResultAck)
+        self.bench.executor.synced(now)
+        return self.bench.sent(m.Call, m.Cancel, m.Command, m.EventAck, m.ResultAck)
 
-    bench.link(0.0)
-    bench.sent()
-    bench.executor.stimulate(0.0, Begin())
+
+def test_what_comes_while_the_disk_is_slow_waits_for_the_next_sync(tmp_path: Path) -> None:
+    """The bell rings while the start of `work` is not yet on disk: it is never started. Otherwise
+    it would move for as long as the next sync takes."""
+    disk = SlowDisk(tmp_path)
+    bench = disk.bench
     bench.ring(0.1)
     bench.go(2.0)
     assert not bench.sent(m.Call, m.Cancel, m.EventAck)
     due = bench.executor.due()
     assert due is None or due > 2.0, "nothing but the end of the sync may wake it"
-    assert [type(message) for message in disk_has_written(2.0)] == [m.Call]
-    assert {type(message) for message in disk_has_written(4.0)} == {m.Cancel, m.EventAck}
-    bench.say(4.1, m.Outcome(WORK, "error", {}, "cancelled"))
-    assert disk_has_written(5.0)
+    assert not disk.writes(2.0)
+    assert [type(message) for message in disk.writes(4.0)] == [m.EventAck]
+    assert [call.id for call in disk.writes(5.0) if isinstance(call, m.Call)] == [TIDY]
     bench.say(5.1, m.Accept(TIDY), m.Outcome(TIDY, "success"))
     assert bench.executor.finished and not bench.executor.over
-    disk_has_written(6.0)
+    disk.writes(6.0)
     assert bench.executor.over
+
+
+def test_what_is_held_before_it_has_begun_does_not_move_until_the_hold_is_on_disk(
+    tmp_path: Path,
+) -> None:
+    """The operator pauses while the start of `work` is not yet on disk: start and hold leave
+    together."""
+    disk = SlowDisk(tmp_path)
+    disk.bench.executor.stimulate(0.1, Pause("by hand"))
+    assert not disk.writes(2.0)
+    call, hold = disk.writes(4.0)
+    assert isinstance(call, m.Call) and isinstance(hold, m.Command) and hold.verb == "hold"
 
 
 def test_only_what_moves_hardware_waits_for_a_slow_disk(tmp_path: Path) -> None:

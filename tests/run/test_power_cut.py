@@ -144,14 +144,10 @@ def test_calls_and_acknowledgements_are_sent_only_after_their_records_are_on_dis
             bench.go(tick / 10)
         store.writer.close()
     assert bench.executor.over
-    expected = [
-        f"call {WORK}",
-        f"cancel {WORK}",
-        "acknowledge bell",
-        f"acknowledge {WORK}",
-        f"call {TIDY}",
-    ]
-    assert sorted(seen) == sorted([*expected, f"acknowledge {TIDY}"])
+    expected = ["acknowledge bell", f"call {TIDY}", f"acknowledge {TIDY}"]
+    if bell >= (disk_waits or 0):  # otherwise `work` is stopped before its call may leave
+        expected += [f"call {WORK}", f"cancel {WORK}", f"acknowledge {WORK}"]
+    assert sorted(seen) == sorted(expected)
 
 
 class Cellar(Laboratory):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,8 @@ def about(server: Server, deep: bool) -> dict[str, Any]:
 
 async def main(settings: dict[str, Any]) -> None:
     """Serve until standard input ends."""
+    if "files" in settings:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (settings["files"], settings["files"]))
     server = build(settings)
     await server.start(settings.get("host", "127.0.0.1"), 0)
     print(server.address[1], flush=True)

@@ -348,6 +348,22 @@ async def test_ten_thousand_connections(
     assert server.grown() < (TOLERATED if link != "TLS" else 64 * MIB)
 
 
+@pytest.mark.parametrize("link", ["plain", "TLS"])
+async def test_strangers_leave_files_to_a_process_that_may_open_few(
+    victim: Start, link: str, certificates: Path
+) -> None:
+    """A node without a free file would not hear an emergency stop."""
+    server = victim(files=64, **({"folder": str(certificates)} if link == "TLS" else {}))
+    async with server.good_client() as good, crowd_at(server, 150) as crowd:
+        assert crowd.stdout is not None
+        assert int(await asyncio.to_thread(crowd.stdout.readline)) == 150
+        for _ in range(5):
+            assert (await asyncio.to_thread(server.about))["fds"] < 64
+            async with _second(server) as second:
+                await second.still_served()
+            await good.still_served()
+
+
 async def test_an_address_that_fails_too_often_is_cut_off(victim: Start) -> None:
     """An address that guesses keys is, after some failures, cut before it sends anything; other
     addresses are served."""

@@ -143,8 +143,8 @@ MUTATIONS = (
     _m(
         "an order leaves after a sync that began before it",
         RUN + "executor.py",
-        "        self._let_leave(now, effects)\n        for",
-        "        self._let_leave(now, effects + self._effects)\n        for",
+        "[e for e in effects if e not in behind]",
+        "effects + self._effects",
         "tests/run",
     ),
     _m(

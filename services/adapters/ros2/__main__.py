@@ -67,7 +67,7 @@ class OfferedTask:
 
     async def serve(self, stop: asyncio.Event) -> None:
         """Serve goals until `stop`; then abort the active one."""
-        action = {"action": self._options.action}
+        action, why = {"action": self._options.action}, ""
         while not stop.is_set():
             for kind, item in self._link.news():
                 if kind == "up":
@@ -75,9 +75,12 @@ class OfferedTask:
                         {"op": "advertise_action", **action, "type": self._options.type}
                     )
                     print(f"{self._options.action} is offered", flush=True)
+                    why = ""
                 elif kind == "down":
                     self._why = "lost"
-                    print(f"no connection to rosbridge: {item}", file=sys.stderr, flush=True)
+                    if item != why:  # not at each attempt
+                        print(f"no connection to rosbridge: {item}", file=sys.stderr, flush=True)
+                    why = item
                 elif kind == "message" and item.get("action") == self._options.action:
                     self._take(item)
             with contextlib.suppress(TimeoutError):

@@ -89,6 +89,8 @@ class ActiveRun:
     """When its deadline ends (s)."""
     held: float | None = None
     """Since when an operator holds it (s)."""
+    released: int = 0
+    """Number of the command that released it last, held or not."""
     stopping: bool = False
     reason: str = ""
 
@@ -113,18 +115,22 @@ class ActiveRuns(dict[str, ActiveRun]):
         """At `due` (s) the run's caller may have been away for too long."""
         heapq.heappush(self._timers, (due, ORPHAN, id_))
 
-    def hold_all(self, now: float, devices: Collection[str], asked: float) -> None:
+    def hold_all(self, now: float, devices: Collection[str], asked: float, number: int) -> None:
         """Stop the clocks of the deadlines of the runs that these devices had ("" for runs without
-        a device) when the hold was asked for (s). A later run begins unheld."""
+        a device) when the hold, command `number`, was asked for (s). A later run begins unheld, and
+        one that was released before the hold was answered goes on."""
         for run in self.values():
             if run.device in devices and run.held is None and run.began <= asked:
-                run.held = now
+                run.held = now if run.released < number else None
 
-    def release_all(self, now: float, devices: Collection[str] | None) -> None:
+    def release_all(self, now: float, devices: Collection[str] | None, number: int) -> None:
         """Restart the stopped deadlines of these devices' runs (None: of all), later by the
-        duration of the pause."""
+        duration of the pause. This is command `number`."""
         for id_, run in self.items():
-            if run.held is None or (devices is not None and run.device not in devices):
+            if devices is not None and run.device not in devices:
+                continue
+            run.released = number
+            if run.held is None:
                 continue
             pause, run.held = now - run.held, None
             if run.limit < NEVER:
@@ -359,7 +365,9 @@ class Callee:
         """Runs whose ACCEPT is held: until when (s), and id. Those of finished runs are left
         out."""
         self._results = ResultStore(self._keeping, self.events.forget_run)
-        self._commands: dict[str, tuple[str, str, float]] = {}
+        self._numbers = 0
+        """How many commands have come."""
+        self._commands: dict[str, tuple[str, str, float, int]] = {}
         """Caller and verb of each command that waits for its answer, and when it came (s)."""
         self._answers: OrderedDict[tuple[str, str], Answer] = OrderedDict()
         """The newest answers by caller and command, for commands that are repeated."""
@@ -588,9 +596,11 @@ class Callee:
         if command.id in self._commands or (peer, command.id) in self._answers:
             self._known_command(peer, command.id)
             return
-        self._commands[command.id] = peer, command.verb, now
+        self._numbers += 1
+        self._commands[command.id] = peer, command.verb, now, self._numbers
         if command.verb == RELEASE:
-            self._running.release_all(now, [command.target] if command.target else None)
+            devices = [command.target] if command.target else None
+            self._running.release_all(now, devices, self._numbers)
             self.soonest = min(self.soonest, self._running.due())
         self._orders.append(command)
 
@@ -690,13 +700,13 @@ class Callee:
         After a `hold`, `answers` in the data says for each device what happened (this node's name
         stands for runs without a device). The deadlines of held runs stand still until a `release`.
         """
-        peer, verb, asked = self._commands.pop(id, ("", "", now))
+        peer, verb, asked, number = self._commands.pop(id, ("", "", now, 0))
         if not peer:
             raise ValueError(f"command {id}: no command with this id waits for an answer")
         if verb == HOLD and data is not None:
             answers = data.get("answers", {})
             held = ["" if d == self.name else d for d, said in answers.items() if said == HELD]
-            self._running.hold_all(now, held, asked)
+            self._running.hold_all(now, held, asked, number)
         answer = Answer(id, ok, plain(data or {}, "data"))
         self._answers[peer, id] = answer
         if len(self._answers) > ANSWERS:

@@ -10,11 +10,12 @@ import contextlib
 import functools
 import logging
 import math
+import resource
 import secrets
 import socket
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any
 
@@ -63,12 +64,19 @@ class LinkTiming:
     """Shortest and longest pause between attempts to connect."""
 
 
-@dataclass(frozen=True, slots=True)
+def allowed(most: int, share: int) -> int:
+    """Return how many connections may be open: `most`, or this share of the files that the process
+    may open. A process without a free file can accept nobody, and its emergency stop is not
+    reached."""
+    return min(most, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // share)
+
+
+@dataclass(frozen=True)
 class LinkLimits:
     """Limits of a server and its connections."""
 
-    connections: int = 256
-    opening: int = 64
+    connections: int = field(default_factory=lambda: allowed(256, 4))
+    opening: int = field(default_factory=lambda: allowed(64, 8))
     """Most connections that have not shown who they are; above it the oldest of them is closed."""
     handshakes: float = 20.0
     """Failed handshakes per second that one address may cause on average."""

@@ -292,8 +292,9 @@ class Server:
         self._closed = False
         self._loop = asyncio.get_running_loop()
         if self.tls is None:
+            at_once = max(1, min(ACCEPTED, self.limits.opening // 4))
             server = await self._loop.create_server(
-                lambda: _ServerLink(self), host, port, backlog=ACCEPTED
+                lambda: _ServerLink(self), host, port, backlog=at_once
             )
             for sock in server.sockets:
                 with sock.dup() as own:

@@ -267,7 +267,7 @@ class ImageServer:
 
     def poll(self) -> None:
         """Accept receivers, read controls and continue writing. Call it often."""
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # also: this process has no file for another one
             for _ in range(ADMITTED):
                 link, _ = self._listener.accept()
                 if len(self._receivers) >= RECEIVERS:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 import ssl
 from collections.abc import Callable
@@ -20,6 +21,10 @@ from typing import Final
 
 ACCEPTED: Final = 32
 """Connections accepted in one turn of the loop."""
+PAUSE: Final = 0.05
+"""Wait after no more could be accepted (s)."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,9 @@ class TlsListener:
         self._shaking: dict[asyncio.Task[None], None] = {}
         self._ending: set[asyncio.Task[None]] = set()
         self._admission: Admission | None = None
+        self._again: asyncio.TimerHandle | None = None
+        self._told = False
+        """Whether it has been logged that there was no file for another connection."""
 
     @property
     def sockets(self) -> tuple[socket.socket, ...]:
@@ -67,6 +75,8 @@ class TlsListener:
         if self._listener.fileno() >= 0:
             self._loop.remove_reader(self._listener)
             self._listener.close()
+        if self._again is not None:
+            self._again.cancel()
         for sock in list(self._waiting):
             self._drop(sock)
         for task in list(self._shaking):
@@ -83,6 +93,9 @@ class TlsListener:
                 sock, address = self._listener.accept()
             except (BlockingIOError, ConnectionError):
                 return
+            except OSError as fault:
+                self._make_room(fault, admission)
+                return
             if not admission.admits(address[0]):
                 sock.close()
                 continue
@@ -92,6 +105,19 @@ class TlsListener:
             timer = self._loop.call_later(self._handshake, self._turn_away, sock)
             self._waiting[sock] = address[0], timer
             self._loop.add_reader(sock, self._begin, sock, admission)
+
+    def _make_room(self, fault: OSError, admission: Admission) -> None:
+        """This process has no file for another connection: close those that have shown nothing yet,
+        and try again soon. Not at once: the loop would do nothing else."""
+        if not self._told:
+            _log.warning("%s: strangers are turned away", fault.strerror)
+            self._told = True
+        for sock in list(self._waiting):
+            self._turn_away(sock)
+        for task in list(self._shaking):
+            self._break_off(task)
+        self._loop.remove_reader(self._listener)
+        self._again = self._loop.call_later(PAUSE, self.start, admission)
 
     def _turn_away(self, sock: socket.socket) -> None:
         address = self._drop(sock)

@@ -306,6 +306,15 @@ def test_a_run_is_aborted_when_its_client_or_link_is_lost(lost: str) -> None:
     assert len(offered) == (2 if lost == "link" else 1)
 
 
+def test_a_missing_rosbridge_is_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    async def steps(page: Page, link: Link) -> None:
+        link.inbox += 3 * [("down", "refused")] + [("up", None), ("down", "refused"), ("up", None)]
+        await until(lambda: len(link.sent) == 3, "the action to be offered again")
+
+    played(steps)
+    assert capsys.readouterr().err.count("no connection to rosbridge: refused") == 2
+
+
 def test_messages_fit_the_definition(tmp_path: Path) -> None:
     """rosbridge drops a message with an unknown field: its goal would never end."""
     (tmp_path / "Mine.action").write_text("---\nstring state\n---\nstring[] places\n")
