@@ -68,7 +68,8 @@ def allowed(most: int, share: int) -> int:
     """Return how many connections may be open: `most`, or this share of the files that the process
     may open. A process without a free file can accept nobody, and its emergency stop is not
     reached."""
-    return min(most, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // share)
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return most if files == resource.RLIM_INFINITY else min(most, files // share)
 
 
 @dataclass(frozen=True)
