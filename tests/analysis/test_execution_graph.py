@@ -496,7 +496,7 @@ def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
 
 
 @pytest.mark.once
-@settings(COMMON, max_examples=25)
+@settings(COMMON, max_examples=12)
 @given(whole_tasks(), st.data())
 def test_every_play_of_the_engine_is_a_path(task: Task, data: st.DataObject) -> None:
     graph_and_engine_agree(task, data)
