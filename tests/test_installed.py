@@ -118,17 +118,13 @@ def test_every_command_of_the_readme(installed: Installed) -> None:
             if user.folder != installed.folder:
                 on_free_port(user.folder)
         elif command == "petrobot up":
-            with _staying(installed, command):
-                limit = Limit("the nodes")
-                while installed.run("petrobot nodes").returncode and limit.left():
-                    time.sleep(0.2)
+            with _staying(installed, command) as said:
+                _until(said, "Ctrl-C stops them all")
                 _try(installed, "petrobot nodes")
                 _try(installed, "petrobot run catch_ball --runs 1 --no-page --quiet")
         elif command == "petrobot serve --up":
-            with _staying(installed, command) as page:
-                limit = Limit("the page")
-                while "http://" not in page.read_text(encoding="utf-8") and limit.left():
-                    time.sleep(0.1)
+            with _staying(installed, command) as said:
+                _until(said, "http://")
         elif command != "petrobot nodes":  # tried while they were up
             _try(user, command)
 
@@ -138,6 +134,12 @@ def _try(installed: Installed, command: str) -> None:
     said = f"{command}: {done.stdout}{done.stderr}"
     assert done.returncode in ENDS.get(command, (0,)), said
     assert "Traceback" not in said
+
+
+def _until(said: Path, text: str) -> None:
+    limit = Limit(text)
+    while text not in said.read_text(encoding="utf-8") and limit.left():
+        time.sleep(0.1)
 
 
 @contextmanager

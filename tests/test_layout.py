@@ -373,10 +373,10 @@ def called(node: ast.AST) -> set[str]:
 
 def asserts(function: ast.AST) -> bool:
     """Whether a function has an assertion of its own."""
-    return bool(called(function) & ASSERTING) or any(
+    return any(
         isinstance(n, ast.Assert) or (isinstance(n, ast.Raise) and "Error" in ast.unparse(n))
         for n in ast.walk(function)
-    )
+    ) or bool(called(function) & ASSERTING)
 
 
 def functions(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:

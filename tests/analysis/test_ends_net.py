@@ -112,7 +112,7 @@ def n_holds_x(task: Task, devices: dict[str, str], limit: int = LIMIT) -> bool:
 
 
 @pytest.mark.once
-@settings(COMMON, max_examples=60)
+@settings(COMMON, max_examples=25)
 @given(tasks(), st.data())
 def test_every_path_of_the_engine_is_one_of_n(task: Task, data: st.DataObject) -> None:
     assume(n_holds_x(task, data.draw(st.sampled_from(({}, DEVICES)))))

@@ -496,7 +496,7 @@ def graph_and_engine_agree(task: Task, data: st.DataObject) -> None:
 
 
 @pytest.mark.once
-@settings(COMMON, max_examples=25)
+@settings(COMMON, max_examples=12)
 @given(whole_tasks(), st.data())
 def test_every_play_of_the_engine_is_a_path(task: Task, data: st.DataObject) -> None:
     graph_and_engine_agree(task, data)
@@ -555,7 +555,7 @@ def with_ends(task: Task, data: st.DataObject) -> Task:
 
 
 @pytest.mark.once
-@settings(COMMON, max_examples=60)
+@settings(COMMON, max_examples=25)
 @given(whole_tasks(), st.data())
 def test_sound_is_what_a_search_from_every_state_says(task: Task, data: st.DataObject) -> None:
     task = with_ends(task, data)
@@ -595,7 +595,7 @@ def partial_refutes_only_what_fails(task: Task, data: st.DataObject) -> None:
 
 
 @pytest.mark.once
-@settings(COMMON, max_examples=60)
+@settings(COMMON, max_examples=20)
 @given(whole_tasks(), st.data())
 def test_a_part_of_the_graph_refutes_only_what_fails(task: Task, data: st.DataObject) -> None:
     partial_refutes_only_what_fails(task, data)

@@ -633,26 +633,14 @@ def test_the_skeletons_of_new_work(tmp_path: Path) -> None:
 
 @pytest.mark.processes
 def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
-    """It has the keys that scripts rely on. The same seed gives the same file, except for
-    wall_s."""
-    results = []
-    for number in range(2):
-        path = tmp_path / f"{number}.json"
-        arguments = (
-            "catch_ball",
-            "--mode",
-            "lockstep",
-            "--runs",
-            "2",
-            "--seed",
-            "1",
-            "--json",
-            str(path),
-        )
-        done = petrobot("run", *arguments, "--quiet")
-        assert done.returncode == 0, done.stderr
-        results.append(json.loads(path.read_text(encoding="utf-8")))
-    for key in (
+    """It has the keys that scripts rely on. That the same seed gives the same file, wherever the
+    nodes run, is shown by tests/integration/test_lockstep_cell.py."""
+    path = tmp_path / "result.json"
+    arguments = ("catch_ball", "--mode", "lockstep", "--runs", "2", "--seed", "1")
+    done = petrobot("run", *arguments, "--json", str(path), "--quiet")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(path.read_text(encoding="utf-8"))
+    assert {
         "task",
         "mode",
         "seed",
@@ -663,14 +651,11 @@ def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
         "wall_s",
         "sim_s",
         "firings",
-    ):
-        assert key in results[0]
+    } <= set(result)
     assert all(
-        {"n", "speed", "caught", "miss_mm", "status"} <= set(throw)
-        for throw in results[0]["throws"]
+        {"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in result["throws"]
     )
-    assert len(results[0]["throws"]) == 2
-    assert {**results[0], "wall_s": 0} == {**results[1], "wall_s": 0}
+    assert len(result["throws"]) == 2
 
 
 PRESSING = """\

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.run.folder import RESULT
+from tests.integration.cell_files import services_file
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
@@ -74,7 +75,9 @@ def _outcomes(steps: list[str], commands: list[str]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("disk", DISKS)
-def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_path: Path) -> None:
+def test_a_disk_that_cannot_be_written_is_reported_in_one_line(
+    disk: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     if not _mounts():
         pytest.skip("this machine gives nobody a mount namespace of his own (unshare -rm)")
     result = shlex.quote(json.dumps({"status": "success"}))
@@ -87,7 +90,8 @@ def test_a_disk_that_cannot_be_written_is_reported_in_one_line(disk: str, tmp_pa
         f"echo {result} > ended/{RESULT}",
         DISKS[disk].format(disk=tmp_path) + " || true",
     ]
-    found = _outcomes(steps, list(COMMANDS))
+    free = f" --services {services_file(tmp_path_factory.mktemp('cell'))}"  # nobody else's ports
+    found = _outcomes(steps, [c + free if c.endswith("up") else c for c in COMMANDS])
     for (command, name), outcome in zip(COMMANDS.items(), found, strict=True):
         said, where = outcome["said"].splitlines(), f"{disk}: petrobot {command}: {outcome}"
         told = [line for line in said if line.startswith(f"petrobot {command.split()[0]}: ")]

@@ -43,7 +43,7 @@ def alive(state: State) -> Counter[str]:
 
 @pytest.mark.once
 @settings(
-    max_examples=80,
+    max_examples=30,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )

@@ -77,15 +77,11 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.processes
-def test_one_process_per_node_gives_the_same(usual: dict[str, Any], tmp_path: Path) -> None:
-    """Coordinator, laboratory, vision and motion in four processes."""
-    assert run(services_file(tmp_path), "--processes", "0") == usual
-
-
-@pytest.mark.processes
-def test_a_third_node_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> None:
-    """Global memory and the sampling timer are on a third node: five processes with laboratory and
-    coordinator."""
+def test_a_process_per_node_and_a_third_node_change_nothing(
+    usual: dict[str, Any], tmp_path: Path
+) -> None:
+    """Coordinator, laboratory, vision, motion, and a third node with global memory and the sampling
+    timer, in five processes."""
     edits = {
         '[timers.image_tick]\nnode = "vision"': '[timers.image_tick]\nnode = "desk"',
         '[services.memory]\nnode = "vision"': '[services.memory]\nnode = "desk"',

@@ -22,7 +22,7 @@ from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 
 pytestmark = pytest.mark.processes
 RUNS = 8
-MANY = 150
+MANY = 60
 """In lock step, where they pass quickly."""
 PATIENCE = 120.0
 QUIET = ("--quiet", "--no-page")

@@ -39,7 +39,7 @@ LATE = 5.0
 """Seconds after its deadline within which a run must have ended on a busy host: grace period, kill,
 and a margin."""
 TEXT = (
-    CELL.replace("worker_memory_mb = 900\n", "worker_memory_mb = 900\nworkers = 6\n")
+    CELL.replace("worker_memory_mb = 900\n", "worker_memory_mb = 450\nworkers = 6\n")
     + """\
 leave_behind = {{ run = "toy_cell.actions:leave_behind", task = "sum", node = "left" }}
 leave_behind_eye = {{ run = "toy_cell.actions:leave_behind", task = "see", device = "eye" }}
@@ -349,7 +349,7 @@ async def test_too_much_memory_ends_only_its_run(own_nodes: Nodes) -> None:
         kept = await operator.call("keep_memory", 20.0)
         assert (kept.status, kept.cause) == ("error", "out_of_memory"), kept
         assert (await nap).status == "success"
-        assert (await operator.call("eat", megabytes=600)).values == {"bytes": 600 << 20}, (
+        assert (await operator.call("eat", megabytes=300)).values == {"bytes": 300 << 20}, (
             "the memory of another run"
         )
         after = set((await pids(operator, "left", "")).values())

@@ -200,7 +200,7 @@ def _live_through(operations: list[tuple[object, ...]]) -> World:
     return world
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(OPERATIONS)
 def test_nothing_runs_twice(operations: list[tuple[object, ...]]) -> None:
     assert _live_through(operations).end(), "no run was recorded"

@@ -183,7 +183,7 @@ async def test_what_was_frozen_before_a_stop_moves_nothing_after_it_is_cleared(
     """The coordinator is frozen at a random moment: before its first run, in a run, or between two.
     Then the stop is given and cleared. When the coordinator continues, its run is aborted."""
     moments = random.Random(7)
-    for number in range(3 if restarts else 8):
+    for number in range(2 if restarts else 4):
         before = turns.begun()
         first = number == 0
         coordinator = turns.start(1.5 if first else 0.02)
@@ -248,7 +248,7 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     def order() -> subprocess.Popen[str]:
         return turns.resume(run) if command == "resume" else turns.start(0.02)
 
-    for moment in (0.0, 0.1, 0.3):
+    for moment in (0.0, 0.1, 0.3) if command == "run" else (0.1,):
         coordinator = order()
         try:
             await beat(moment)

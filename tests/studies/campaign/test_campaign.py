@@ -335,7 +335,7 @@ def test_the_memory_of_a_block_is_freed_before_the_next_one(
 
 def test_learning_depends_only_on_batches(conduct: Conduct) -> None:
     """Interrupted within a batch and resumed, it makes the same choices and learns the same."""
-    learning = {"selector": "nikolic_fu_fast", "runs": 60, "batch": 12, "options": {"rho": 0.1}}
+    learning = {"selector": "nikolic_fu_fast", "runs": 36, "batch": 12, "options": {"rho": 0.1}}
     whole = conduct("whole", **learning)
     for fails_at in (6, 8, 11):
         with pytest.raises(KeyboardInterrupt):

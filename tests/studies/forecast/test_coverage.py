@@ -167,7 +167,7 @@ def test_trials_of_one_mission_that_are_alike_count_as_fewer() -> None:
     without such an effect nothing changes."""
     task, hits = coverage.worlds()[0].task, dict.fromkeys((*module.SHARES, *module.TIMES), 0)
     apart, plain, effects = 0, 0, []
-    for seed in range(60):
+    for seed in range(25):
         random = np.random.default_rng(seed)
         known = Training.of(task, by_missions(random, 200, 1.5))
         new = figures(measured(Training.of(task, by_missions(random, 200, 1.5))))
@@ -181,7 +181,7 @@ def test_trials_of_one_mission_that_are_alike_count_as_fewer() -> None:
         alone = Training.of(task, by_missions(random, 200, 0.0))
         even = module.predict(alone, module.Request(200, choices_of(alone), net=False))
         apart += even["law"]["likeness"] == 1.0
-    assert min(hits.values()) >= binom.ppf(1e-4, 60, 0.95), hits
-    assert plain < binom.ppf(1e-3, 60, 0.95)
+    assert min(hits.values()) >= binom.ppf(1e-4, 25, 0.95), hits
+    assert plain < binom.ppf(1e-3, 25, 0.95)
     assert 2.0 < float(np.median(effects)) < 4.0
-    assert apart >= 45
+    assert apart >= 19
