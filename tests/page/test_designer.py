@@ -464,6 +464,7 @@ async def test_a_hundred_and_twenty_places_without_positions(
     await tab.keyboard.press("Enter")
     await expect(properties(tab).get_by_label("Name", exact=True)).to_have_value("p77")
     await expect(element(tab, "^Action place p77,")).to_be_in_viewport()
+    await expect(tab.locator(".designer .hits li")).to_have_count(0)  # they would cover it
     await tab.get_by_role("button", name="Error branches").click()
     await expect(element(tab, "^Transition e5$")).to_be_hidden()
     await tab.get_by_role("button", name="Error branches").click()
