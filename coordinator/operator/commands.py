@@ -51,8 +51,6 @@ _log = logging.getLogger(__package__)
 
 ANSWERS = 1.5
 """Time for nodes to answer a pause (s)."""
-STOP_ANSWER = 0.5
-"""Longest wait of an emergency stop for the journal's disk (s): `petrobot estop` waits for 1 s."""
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
 """Commands that only configure the run and move nothing."""
@@ -334,12 +332,8 @@ class Operation(Followed):
         )
         if self._live and (self._stopping is None or self._stopping.done()):
             self._stopping = asyncio.get_running_loop().create_task(self._stop_again())
-        await asyncio.wait({journaled}, timeout=STOP_ANSWER)
-        if not journaled.done():
-            return refusal(
-                "journal", "the nodes were told to stop; the journal's disk is slow to store it"
-            )
-        answer = journaled.result()
+        # The stop has left: a slow disk must not make it look as if it had not.
+        answer = journaled.result() if journaled.done() else {"ok": True}
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
 
     async def _stop_again(self) -> None:

@@ -6,9 +6,9 @@ continues a run whose coordinator died. `coordinator/operator/session.py` leads 
 
 from __future__ import annotations
 
-import asyncio
 import math
 import shutil
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -105,8 +105,8 @@ def prepare(
     directory: Directory,
     observers: Sequence[Observer] = (),
 ) -> RunSession:
-    """Make a new run of a task; `text` is the task file's. In real time, call it in the event loop
-    that leads the run; in lock step it may take seconds (it loads the simulated cell).
+    """Make a new run of a task; `text` is the task file's. It may take seconds: it writes to the
+    disk, and in lock step it loads the simulated cell.
 
     Raises EstimatesError or RequestError for what it cannot learn or replace, JournalError or
     OSError when its journal cannot be written, KeyFileError. No folder is left behind then.
@@ -222,7 +222,7 @@ def _resumed(found: Recorded, observers: Sequence[Observer], ordered: float) -> 
         )
     replayed = [*observers, *([learning.selector] if learning is not None else [])]
     lockstep = then["mode"] == LOCKSTEP
-    now = 0.0 if lockstep else asyncio.get_running_loop().time()
+    now = 0.0 if lockstep else time.monotonic()
     shown: list[Shown] = []
 
     def see(origin: float) -> Sequence[Observer]:
@@ -284,7 +284,7 @@ def _new(
     identity = mission_id(setting.task)
     folder = None if request.folder is None else request.folder / identity
     name = lockstep_id(setting) if lockstep else identity
-    origin = 0.0 if lockstep else asyncio.get_running_loop().time()
+    origin = 0.0 if lockstep else time.monotonic()
     store = None
     if folder is not None:
         task, runs = with_runs(setting.task, setting.runs)

@@ -272,10 +272,7 @@ class Station(Followed):
             self._forget(name)
         self._revision = text.revision
         request = replace(self._own(read_start(task, data, self._estimates)), ordered=ordered)
-        if request.mode == LOCKSTEP:
-            run = await asyncio.to_thread(prepare, request, task, text.text, self.directory)
-        else:
-            run = prepare(request, task, text.text, self.directory)
+        run = await asyncio.to_thread(prepare, request, task, text.text, self.directory)
         try:
             await run.connect()
         except UnreachableError as fault:

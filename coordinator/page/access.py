@@ -22,6 +22,8 @@ from petrobot.services.comm.calls.link import allowed
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 HEADERS = {
+    # Without this, a browser would mix the scripts of two versions of petrobot after an update
+    "Cache-Control": "no-store",
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: "
         "blob:; connect-src 'self'; "

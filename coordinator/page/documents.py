@@ -109,10 +109,7 @@ async def _export(request: web.Request) -> web.Response:
     return web.Response(
         text=made["text"],
         content_type=made["content_type"],
-        headers={
-            "Content-Disposition": f'attachment; filename="{name}.{form}"',
-            "Cache-Control": "no-store",
-        },
+        headers={"Content-Disposition": f'attachment; filename="{name}.{form}"'},
     )
 
 

@@ -40,11 +40,7 @@ async def read_object(request: web.Request) -> dict[str, Any]:
 
 async def send_json(request: web.Request, text: bytes) -> web.StreamResponse:
     """Answer with JSON text in pieces, so that a long answer does not delay other clients."""
-    headers = {
-        **HEADERS,
-        "Cache-Control": "no-store",
-        "Content-Type": "application/json; charset=utf-8",
-    }
+    headers = {**HEADERS, "Content-Type": "application/json; charset=utf-8"}
     response = web.StreamResponse(headers=headers)
     response.content_length = len(text)
     with contextlib.suppress(ConnectionError):  # The client has left meanwhile.
@@ -56,7 +52,7 @@ async def send_json(request: web.Request, text: bytes) -> web.StreamResponse:
 
 
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
-    """Return an answer that no cache stores."""
+    """Return a value as an answer in JSON."""
     # A lone surrogate is not valid text.
     body = json_text(value, ensure_ascii=False).encode("utf-8", "replace")
     return web.Response(
@@ -64,7 +60,6 @@ def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> 
         status=status,
         content_type="application/json",
         charset="utf-8",
-        headers={"Cache-Control": "no-store"},
     )
 
 

@@ -145,7 +145,7 @@ async def _index(request: web.Request) -> web.StreamResponse:
         away = web.HTTPSeeOther("/")
         access.hand_out(away)
         raise away
-    return web.FileResponse(PAGE_FILES / "index.html", headers={"Cache-Control": "no-store"})
+    return web.FileResponse(PAGE_FILES / "index.html")
 
 
 # The live protocol over HTTP: the WebSocket, and the same commands and snapshot for scripts.

@@ -129,7 +129,11 @@ class RealtimeMission:
         proves: Credentials | None = None,
         ordered: float = math.inf,
     ) -> None:
-        """`ordered`: when the operator ordered the run (`uptime`); infinity: after everything."""
+        """Needs no event loop before `connect`: writing the journal's header may take seconds, so
+        that a run is made in another thread.
+
+        `ordered`: when the operator ordered the run (`uptime`); infinity: after everything.
+        """
         self.mission = mission
         self._directory = directory
         self._ordered = ordered
@@ -142,7 +146,6 @@ class RealtimeMission:
         self._missed: list[str] | None = []
         """Nodes that cleared an emergency stop after that; None once all nodes are connected: from
         then on the callers count the stops."""
-        self._loop = asyncio.get_running_loop()
         self._over = asyncio.Event()
         self._closed = False
         self._fault: BaseException | None = None
@@ -154,22 +157,27 @@ class RealtimeMission:
         self._slowest_sync = 0.0
         """Longest time that a sync took (s)."""
         mission.executor.in_background = self._sync
-        key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
-        self.clients: Mapping[str, Client] = {
-            name: Client(
-                node.host,
-                node.port,
-                mission.callers[name],
-                on_notices=self._hear(name),
-                key=key,
-                tls=tls,
-            )
-            for name, node in directory.nodes.items()
-        }
+        self._key, self._tls = (proves.key, proves.client()) if proves is not None else (None, None)
+        self.clients: Mapping[str, Client] = {}
+
+    @property
+    def _loop(self) -> asyncio.AbstractEventLoop:
+        return asyncio.get_running_loop()
 
     async def connect(self, timeout: float = 5.0) -> None:
         """Connect to every node. Raises UnreachableError with those that cannot be reached, and
         MissionError if an emergency stop was given and cleared after the run was ordered."""
+        self.clients = {
+            name: Client(
+                node.host,
+                node.port,
+                self.mission.callers[name],
+                on_notices=self._hear(name),
+                key=self._key,
+                tls=self._tls,
+            )
+            for name, node in self._directory.nodes.items()
+        }
         for client in self.clients.values():
             client.start()
         reached = await asyncio.gather(
@@ -353,9 +361,10 @@ class RealtimeMission:
     def _sync(self, work: Callable[[], None]) -> None:
         """Make the journal durable in a thread. It ends with the process, not the other way: the
         disk may never answer."""
-        began, done = self.now(), self._loop.create_future()
+        loop, began = self._loop, self.now()
+        done = loop.create_future()
         text = f"the disk of the journal has not answered for {DISK_PATIENCE:g} s"
-        patience = self._loop.call_at(began + DISK_PATIENCE, self.fail, JournalError(text))
+        patience = loop.call_at(began + DISK_PATIENCE, self.fail, JournalError(text))
 
         def end(fault: Exception | None) -> None:
             patience.cancel()
@@ -369,7 +378,7 @@ class RealtimeMission:
             except Exception as found:
                 fault = found
             with suppress(RuntimeError):  # the loop was closed, because this took so long
-                self._loop.call_soon_threadsafe(end, fault)
+                loop.call_soon_threadsafe(end, fault)
 
         self._syncing = done
         Thread(target=sync, name="journal", daemon=True).start()

@@ -383,6 +383,12 @@ SORTING: Mapping[str, Mapping[str, Any]] = {
         ({"no_fetch": {"out": "parts"}}, "arm == 1", "next needs arm, which is empty"),
         ({}, "arm == 2", "no transition takes what is left, and the end asks for arm == 2 (it "),
         (
+            {},
+            "(arm > 1 or arm > 2) and arm == 2",
+            "no transition takes what is left, and the end asks for parts == 0 and (arm > 1 or "
+            "arm > 2) and arm == 2, or for",
+        ),
+        (
             {"fetched": {"out": "hand"}, "stored": {"in": "hand depot", "out": "arm store"}},
             "arm == 1",
             "stored needs depot, which is empty",

@@ -185,12 +185,13 @@ async def test_a_command_is_answered_when_the_run_ends_before_its_disk_has_writt
 async def test_an_emergency_stop_is_answered_before_a_slow_disk(
     petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The nodes are told first; the record of it waits."""
     goes_on = threading.Event()
     await petrobot.working()
     monkeypatch.setattr(os, "fdatasync", lambda _: goes_on.wait(PATIENCE_S))
     try:
         said = await petrobot.operation.command("ana", "estop", {})
-        assert not said["ok"] and said["text"].startswith("the nodes were told to stop")
+        assert said["ok"]
         await until(lambda: not petrobot.arm.moving)
     finally:
         goes_on.set()

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from tests.operator.conftest import TASK, Cell
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.processes
 
@@ -207,3 +208,37 @@ async def test_an_emergency_stop_needs_no_run(cell: Cell) -> None:
     assert cell.state["mission"]["state"] == "stopped" and "ben" in cell.state["mission"]["reason"]
     assert (await cell.say("clear_estop"))["ok"]
     assert cell.state["mission"]["state"] == "idle"
+
+
+async def test_a_slow_disk_delays_a_start_and_neither_the_page_nor_a_stop(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sync of 12 s made the page report a lost connection, and an emergency stop that had reached
+    all nodes seem to have failed. Nothing starts after it."""
+    goes_on, syncs = threading.Event(), list[int]()
+
+    def fdatasync(file: int) -> None:
+        syncs.append(file)
+        assert goes_on.wait(PATIENCE_S)
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    try:
+        starting = asyncio.create_task(cell.say("start", task="moving"))
+        await until(lambda: syncs)
+        assert cell.state["mission"]["state"] == "preparing"
+        assert (await cell.station.command("ben", "estop", {}))["ok"] and not starting.done()
+    finally:
+        goes_on.set()
+    assert (await starting)["code"] == "stopped"
+    assert not list(cell.runs.glob("*"))
+    assert (await cell.say("clear_estop"))["ok"]
+
+    assert (await cell.say("start", task="moving"))["ok"]
+    await until(lambda: cell.state["mission"]["state"] == "running")
+    assert (await cell.say("pause"))["ok"]
+    goes_on.clear()
+    try:
+        assert (await cell.station.command("ben", "estop", {}))["ok"], "it waits for no disk"
+    finally:
+        goes_on.set()
+    assert (await cell.ended())["status"] == "error"

@@ -202,10 +202,12 @@ async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
 
 
 async def test_every_answer_carries_the_headers(page: Page) -> None:
-    """Pages, data and refusals have a strict content policy, and forbid sniffing, framing and
-    referrers."""
+    """Pages, data and refusals have a strict content policy, and forbid sniffing, framing,
+    referrers and caches: after an update a browser mixed the scripts of two versions."""
+    assert HEADERS["Cache-Control"] == "no-store"
     for path, headers in (
         ("/", bearer(page)),
+        ("/page/js/main.js", bearer(page)),
         ("/api/tasks", bearer(page)),
         ("/nowhere", bearer(page)),
         ("/", {}),

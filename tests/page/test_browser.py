@@ -91,7 +91,7 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     await expect(
         tab.get_by_role("region", name="Last firings").get_by_role("listitem")
     ).to_have_count(before + 1)
-    await expect(toolbar).to_contain_text("Paused after one firing")
+    await expect(tab.locator(".pause-note")).to_contain_text("Paused after one firing")
     await expect(mission).to_contain_text("Paused")
     assert stage.state.firings == before + 1
     await element(tab, "^Control place jobs", "Task net").click()
@@ -688,3 +688,53 @@ async def test_values_are_shown_where_they_are_used(
             "last run of pickstatus error, reason slipped",
         ]
     )
+
+
+async def test_a_small_window_shows_what_a_pause_did_and_a_stop_in_one_row(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """In a window of 1280 x 720 the answers to a pause could be read only two words at a time, and
+    the button that clears a stop made the row of buttons twice as high. Messages leave Find free,
+    and a command that waits says so: without it, the button looked dead."""
+    answering = asyncio.Event()
+    pause = stage._pause
+
+    async def slow_pause(who: str, data: Any) -> dict[str, Any]:
+        answer = await pause(who, data)
+        await answering.wait()
+        return answer
+
+    stage.__dict__["_pause"] = slow_pause
+    tab = await opened(browser, page)
+    await tab.set_viewport_size({"width": 1280, "height": 720})
+    await start_mission(tab)
+    toolbar = tab.get_by_role("toolbar", name="Mission")
+    step = toolbar.get_by_role("button", name="Step")
+    before, row = await step.bounding_box(), await toolbar.bounding_box()
+    await toolbar.get_by_role("button", name="Pause").click()
+    message = tab.locator(".toast", has_text="Pause: waiting for the coordinator's answer")
+    await expect(message).to_be_visible()
+    finder = tab.get_by_label("Find a place or transition").first
+    box, find = await message.bounding_box(), await finder.bounding_box()
+    assert box is not None and find is not None and box["x"] > find["x"] + find["width"]
+    answering.set()
+    await expect(message).to_have_count(0)
+    note = tab.locator(".pause-note")
+    await expect(note).to_contain_text("Paused")
+    assert await note.evaluate("(note) => note.scrollHeight <= note.clientHeight + 1")
+    assert await step.bounding_box() == before, "no button moves"
+    await tab.keyboard.press("F9")
+    await expect(toolbar.get_by_role("button", name="Clear the stop")).to_be_visible()
+    assert await toolbar.bounding_box() == row
+
+
+async def test_a_new_task_shows_nothing_of_the_one_before(browser: Browser, page: Page) -> None:
+    """The overview in the corner still showed the net that was open before."""
+    tab = await designer(browser, page)
+    overview = tab.locator(".designer .minimap")
+    for _ in range(4):
+        await tab.locator(".designer").get_by_role("button", name="Zoom in").click()
+    await expect(overview).to_be_visible()
+    await tab.get_by_role("button", name="New task").click()
+    await settled(tab)
+    await expect(overview).to_be_hidden()

@@ -9,6 +9,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 
@@ -464,6 +465,7 @@ async def test_a_hundred_and_twenty_places_without_positions(
     await tab.keyboard.press("Enter")
     await expect(properties(tab).get_by_label("Name", exact=True)).to_have_value("p77")
     await expect(element(tab, "^Action place p77,")).to_be_in_viewport()
+    await expect(tab.locator(".designer .hits li")).to_have_count(0)  # they would cover it
     await tab.get_by_role("button", name="Error branches").click()
     await expect(element(tab, "^Transition e5$")).to_be_hidden()
     await tab.get_by_role("button", name="Error branches").click()
@@ -627,6 +629,25 @@ async def test_labels_on_the_page_cover_nothing(browser: Browser, page: Page, ta
         total["words_on_words"] == total["words_on_elements"] == total["elements_on_elements"] == 0
     ), total
     assert total["struck"] <= 0.1 * total["words"], total
+
+
+async def test_a_label_leaves_room_for_those_that_are_put_later(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """The condition of `held` has room only above it. The names beside it, which were put before,
+    covered it, and one another."""
+    shipped = files("petrobot.coordinator") / "tasks" / "pick_and_place.toml"
+    (tasks / "shipped.toml").write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
+    tab, _ = await designing(browser, page, "shipped")
+    await tab.get_by_role("button", name="Error branches").click()
+    boxes = [
+        await tab.locator(f".designer [data-name='{name}'] {part}").bounding_box()
+        for name, part in (("verify_grasp", ".label"), ("held", ".sub"), ("in_hand", ".label"))
+    ]
+    for one, other in pairwise(boxes):
+        assert one is not None and other is not None
+        apart = one["x"] + one["width"] < other["x"] or abs(one["y"] - other["y"]) > other["height"]
+        assert apart, (one, other)
 
 
 # ---- while something else happens

@@ -309,7 +309,8 @@ def _asked(
     if not missed and busy:
         names = " or ".join(busy)
         missed.append(f"no active run of {names} (only places with `listen` may have one)")
-    ends = [" and ".join(dict.fromkeys(missed))]
+    whole = str(task.final)
+    ends = [whole if whole in missed else " and ".join(missed)]
     ends += [str(task.final_error)] if task.final_error is not None else []
     return ", or for ".join(ends), spent, left, tuple(gone)
 

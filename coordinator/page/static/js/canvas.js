@@ -72,6 +72,7 @@ export class Canvas {
     if (event.key === "Enter" && this.found?.length) {
       this.turn = (this.turn + 1) % this.found.length;
       this.found[this.turn].go();
+      fill(this.hits); // the list would cover what was found, which is now in the middle
     } else if (event.key === "Escape") {
       this.query.value = "";
       this.find();

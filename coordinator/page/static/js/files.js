@@ -213,7 +213,7 @@ function showPicture(title, name, svg) {
 /** Ask for a name; null when it was cancelled. */
 export function askName(title, value) {
   const input = h("input", { value, "aria-label": "Name", pattern: "[A-Za-z0-9_][A-Za-z0-9_\\-]{0,63}", required: true });
-  const answer = askValue(title, input, h("p", { class: "muted" }, "Letters, digits, _ and - ."));
+  const answer = askValue(title, input, h("p", { class: "muted" }, "Letters, digits, underscores and hyphens."));
   input.select();
   return answer;
 }

@@ -224,7 +224,7 @@ export class Link {
     return new Promise((resolve) => {
       this.answers.set(id, resolve);
       setTimeout(() => {
-        if (this.answers.delete(id)) resolve({ ok: false, code: "silent", text: "the coordinator did not answer" });
+        if (this.answers.delete(id)) resolve({ ok: false, code: "silent", text: `not confirmed within ${ANSWER_MS / 1000} s; it may still take effect` });
       }, ANSWER_MS);
     });
   }

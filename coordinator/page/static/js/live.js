@@ -185,8 +185,8 @@ export class Live {
     text(action, words(run.action));
     text(where, run.node);
     text(why, [run.primitive_task && run.primitive_task !== run.action ? `for ${words(run.primitive_task)}` : "", run.why].filter(Boolean).join(": "));
-    if (run.progress === undefined || run.progress === null) bar.removeAttribute("value");
-    else if (bar.value !== run.progress || !bar.hasAttribute("value")) bar.value = run.progress;
+    bar.hidden = (run.progress ?? null) === null; // an empty bar would look like an action that is stuck
+    if (!bar.hidden && bar.value !== run.progress) bar.value = run.progress;
     text(state, words(run.state ?? "running"));
     attribute(node, "data-state", run.state ?? "running");
     this.cardClock(node, this.link.now());

@@ -28,7 +28,7 @@ class App {
     this.wall = h("button", { type: "button", class: "tool", "aria-label": "Wall screen: larger type", title: "Wall screen: larger type", "aria-pressed": "false", onclick: () => this.setWall(!this.isWall) }, icon("wall"));
     this.header = h("header", { class: "top" }, h("span", { class: "brand" }, mark(), "petrobot"), this.switch, this.banner.root, h("div", { class: "spacer" }), this.wall, this.theme, this.operator.estop);
     this.stage = h("main", { class: "main" }, Object.values(this.tabs).map((tab) => tab.root));
-    root.replaceChildren(this.header, this.lost.root, this.operator.bar, this.stage);
+    root.replaceChildren(this.header, this.lost.root, this.operator.bar, this.operator.answer, this.stage);
     this.setTheme(localStorage.getItem("petrobot.theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
     this.setWall(localStorage.getItem("petrobot.wall") === "yes");
     this.show(this.addressed() ?? "Live");

@@ -19,6 +19,7 @@ export class Minimap {
   draw(view) {
     this.view = view;
     const box = view.box;
+    this.svg.parentElement.hidden = !box;
     if (!box) return;
     this.scale = Math.min(W / (box[2] - box[0]), H / (box[3] - box[1]));
     this.left = (W - (box[2] - box[0]) * this.scale) / 2 - box[0] * this.scale;

@@ -175,8 +175,9 @@ export class NetView {
     const labelled = [...names].map((name) => this.elements.get(name)).filter((e) => e && !this.isFolded(e));
     for (const element of labelled) element.boxes = null;
     const ground = new Ground([...this.elements.values()].filter((e) => !this.isFolded(e)), [...this.arcs.values()].filter((a) => shown(a.place) && shown(a.transition)));
+    for (const element of labelled) ground.settle(element);
     for (const element of labelled) {
-      const side = ground.settle(element);
+      const side = ground.settle(element); // again: the first ones did not know where the last ones would be
       const [x, y, below, anchor] = labelAt(element, side);
       const { label, sub } = element.parts;
       attribute(label, "x", x);

@@ -7,6 +7,7 @@ import { clearDialog, startDialog } from "./start.js";
 import { toast } from "./toast.js";
 
 const ESTOP_KEY = "F9";
+const SLOW_MS = 2000; // a command that waits longer, such as for a slow disk, says so
 const STOP_MS = 1500; // without an answer for so long, an emergency stop takes another way
 
 const ABOUT_CONTROLS = ["take_controls", "ask_controls", "release_controls"]; // all other commands take free controls
@@ -20,7 +21,7 @@ const STATE_WORD = {
   idle: "Idle", preparing: "Preparing", running: "Running", stopping: "Stopping", paused: "Paused", success: "Success",
   failure: "Failure", error: "Error", aborted: "Aborted", stopped: "Emergency stop",
 };
-const PAUSE_WORD = { operator: "Paused by the operator", step: "Paused after one firing" };
+const PAUSE_WORD = { step: "Paused after one firing" };
 const HELD_WORD = { held: "held", idle: "no action to hold", cannot_hold: "cannot hold", stopped: "stopped", lost: "no answer" };
 
 /** What a pause was answered by each node, for people. */
@@ -47,7 +48,7 @@ export class Operator {
     this.controls = h("div", { class: "holder" });
     this.press = new Press(this.controls);
     this.answer = h("p", { class: "pause-note", role: "status" });
-    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, this.picker, this.buttons.start, this.options, Object.values(this.buttons).slice(1), this.clear, this.answer, this.controls);
+    this.bar = h("div", { class: "operator", role: "toolbar", "aria-label": "Mission" }, this.picker, this.clear, this.buttons.start, this.options, Object.values(this.buttons).slice(1), this.controls);
     this.estop = h("button", { type: "button", class: "estop", "aria-keyshortcuts": ESTOP_KEY, onclick: () => this.stopNow() },
       icon("stop"), h("span", {}, "Emergency stop"), h("kbd", {}, ESTOP_KEY));
     addEventListener("keydown", (event) => {
@@ -59,10 +60,15 @@ export class Operator {
 
   /** Give a command and tell how it was answered. */
   async give(verb, data, silent = false, shown = false) {
+    const name = this.buttons[verb]?.textContent || words(verb);
     const held = ABOUT_CONTROLS.includes(verb) ? { ok: true } : await this.hold();
+    let waits = null;
+    const slow = setTimeout(() => (waits = toast("waiting", `${name}: waiting for the coordinator's answer`)), SLOW_MS);
     const answer = held.ok ? await this.link.command(verb, data) : held;
+    clearTimeout(slow);
+    waits?.remove();
     if (!answer.ok && shown) return answer; // the dialog that asked shows why
-    if (!answer.ok) toast("error", `${words(verb)}: ${answer.text ?? answer.code ?? "refused"}`);
+    if (!answer.ok) toast("error", `${name}: ${answer.text ?? answer.code ?? "refused"}`);
     else if (!silent) toast("ok", [DONE[verb] ?? words(verb), answer.text, verb === "pause" ? heldWords(answer.nodes) : ""].filter(Boolean).join(" · "));
     return answer;
   }
@@ -128,9 +134,9 @@ export class Operator {
     const set = { start: may && !live && now !== "preparing" && now !== "stopped", pause: may && now === "running", step: may && now === "paused", resume: may && now === "paused", abort: may && live };
     for (const [verb, on] of Object.entries(set)) this.buttons[verb].disabled = !on;
     this.showTasks(state, may && !live && now !== "preparing");
-    this.buttons.start.hidden = state.mission.starts === false;
+    this.buttons.start.hidden = state.mission.starts === false || now === "stopped"; // in its place: Clear the stop
     this.buttons.start.disabled ||= !state.task;
-    this.options.hidden = state.mission.starts === false || !state.mission.file;
+    this.options.hidden = this.buttons.start.hidden || !state.mission.file;
     this.options.disabled = this.buttons.start.disabled;
     this.clear.hidden = now !== "stopped";
     this.clear.disabled = !may;
@@ -168,8 +174,8 @@ export class Operator {
   }
 
   showPause(state) {
-    const { paused } = state;
-    const reason = PAUSE_WORD[paused?.reason] ?? (paused?.reason ? `Paused: ${words(paused.reason)}` : "Paused");
+    const { paused, you } = state;
+    const reason = paused?.reason === `by ${you}` ? "Paused by you" : PAUSE_WORD[paused?.reason] ?? (paused?.reason ? `Paused: ${words(paused.reason)}` : "Paused");
     text(this.answer, paused ? [reason, heldWords(paused.nodes)].filter(Boolean).join(". ") : "");
   }
 
@@ -179,8 +185,10 @@ export class Operator {
     if (this.holderKey === key || this.press.holds(() => this.showHolder(this.link.state))) return;
     this.holderKey = key;
     const mine = controls.holder === you;
-    const label = controls.holder === null ? "The controls are free" : mine ? "You hold the controls" : `${controls.holder} holds the controls`;
     const asking = (controls.asking ?? []).filter((who) => who !== you);
+    // Beside "Hand over to ..." it goes without saying, and a small window has no room for both
+    const held = asking.length ? "" : "You hold the controls";
+    const label = controls.holder === null ? "The controls are free" : mine ? held : `${controls.holder} holds the controls`;
     const actions = [];
     if (controls.holder === null) actions.push(this.small("Take controls", () => this.give("take_controls", {})));
     else if (mine) {
