@@ -20,6 +20,7 @@ from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.ordinary import contended
 from petrobot.coordinator.analysis.time.measured import (
     LATE,
+    SHORTEST,
     Ending,
     Measured,
     branching_places,
@@ -94,8 +95,6 @@ def incidences(times: Sequence[float], causes: Sequence[str | None]) -> dict[str
 
 
 ChoiceShares = Mapping[str, Mapping[str, float]]
-SHORTEST = 1e-3
-"""Shortest duration (s) in the stochastic view, which does not allow a duration of 0."""
 
 
 # --- estimates into the stochastic view ---
@@ -215,7 +214,7 @@ def _preempting(task: Task, place: str) -> set[str]:
     return {
         t.name
         for t in task.flat.transitions.values()
-        if is_cause(t) and any(a.place == place and a.end is not None for a in t.inputs)
+        if is_cause(task.flat, t) and any(a.place == place and a.end is not None for a in t.inputs)
     }
 
 

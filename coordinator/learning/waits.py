@@ -1,4 +1,4 @@
-"""How long transitions wait for external events, from which the rates of events are estimated.
+"""How long transitions wait for events, from which the rates of events are estimated.
 
 The rate of an event that comes by itself is how often it came, over the time in which it could have
 served the transition (its exposure). The time of a wait that ended without the event, because the
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from petrobot.coordinator.analysis.time.measured import is_cause
 from petrobot.coordinator.engine.state import Mode, Phase, State
 from petrobot.coordinator.engine.stimuli import EventOccurred, RaiseEvent, Stimulus
 from petrobot.coordinator.learning.records import Waited, WaitEnd
@@ -31,7 +32,7 @@ def memory_of(task: Task, t: Transition) -> tuple[EventMemory, EarlyEvent] | Non
 class EventWaits:
     """Measures the waits from the stimuli, firings and states of a mission run.
 
-    Preempting transitions are left out: their event is a way in which the run ends.
+    Causes of preemption are left out: their event is a way in which the run ends.
     """
 
     def __init__(self, task: Task) -> None:
@@ -40,7 +41,7 @@ class EventWaits:
         self._watched = {
             t.name: t
             for t in flat.transitions.values()
-            if t.events and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
+            if t.events and not is_cause(flat, t) and all(a.end is not End.GOING for a in t.inputs)
         }
         self._memory = {name: memory_of(flat, t) for name, t in self._watched.items()}
         self._since: dict[str, float] = {}
@@ -65,8 +66,9 @@ class EventWaits:
         """Return the wait that this firing ends; None if it ends none."""
         if transition in self._came:
             return Waited(transition, self._came.pop(transition), WaitEnd.FIRED)
-        if transition in self._since and self._memory[transition] is None:
-            return Waited(transition, round(now - self._since.pop(transition), DIGITS))
+        if transition in self._watched and self._memory[transition] is None:
+            # what it waited for may all have come before it could fire
+            return Waited(transition, round(now - self._since.pop(transition, now), DIGITS))
         return None
 
     def cut(self, now: float) -> list[Waited]:
@@ -106,7 +108,10 @@ class EventWaits:
             return False
         return memory is EventMemory.LATCHED or all(
             sum(
-                run.phase is Phase.DONE and (run.status is Status.ERROR) == (a.end is End.ERROR)
+                run.phase is not Phase.DONE
+                if a.end is End.PREEMPT
+                else run.phase is Phase.DONE
+                and (run.status is Status.ERROR) == (a.end is End.ERROR)
                 for run in state.tokens.get(a.place, ())
             )
             >= a.weight

@@ -275,9 +275,9 @@ class _Builder:
         self.plans: dict[int, _Plan] = {}
         self.causes = {
             (a.place, t.name)
-            for t in filter(is_cause, self.task.transitions.values())
+            for t in self.task.transitions.values()
             for a in t.inputs
-            if a.end is not None and self._covered(a.place)
+            if a.end is not None and is_cause(self.task, t) and self._covered(a.place)
         }
         """Preemptions that are measured as a cause by which a run ends."""
 
@@ -590,6 +590,8 @@ class _Builder:
                     for t in x.engine.compiled.transitions
                     for a in t.actions
                     if a.name == run.place and stimulus.event in a.raised
+                    if not self.numbers.waits_ready(t)
+                    or self.task.net.has_concession(state.marking, t.index)
                 }
                 drawn = {name for name in waiting if (run.place, name) in self.causes}
                 for name in drawn:

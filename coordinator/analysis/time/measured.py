@@ -12,7 +12,18 @@ from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import NamedTuple, TypeVar
 
-from petrobot.coordinator.task import End, Estimate, Executed, Kind, Place, Status, Task, Transition
+from petrobot.coordinator.task import (
+    End,
+    Estimate,
+    Executed,
+    Kind,
+    Place,
+    Scope,
+    Status,
+    Task,
+    Transition,
+)
+from petrobot.coordinator.task.compiled_task import CompiledTransition
 
 K = TypeVar("K", bound=Hashable)
 Ending = tuple[str, str]
@@ -31,7 +42,8 @@ class Measured:
 
     - `runs[(place or primitive task, action)]`: share, mean (s) and cv by status.
     - `choice[primitive task][action]`: current probability of each alternative.
-    - `waits[event]`: mean time (s) that a transition waits for the event.
+    - `waits[event]`: mean time (s) that a transition waits for the event: for an internal one, once
+      it has everything else.
     - `switches[transition]`: how often its condition is true, relative to the transitions that
       compete with it.
     - `causes[(place or primitive task, action)]`: by status, how often its own ends with that
@@ -71,6 +83,8 @@ class OwnEnd(NamedTuple):
         return f"{self.status}{' late' if self.late else ''}"
 
 
+SHORTEST = 1e-3
+"""Shortest duration (s) in the stochastic view, which does not allow a duration of 0."""
 NEVER = 1e-6
 """Share of runs below which none is taken to reach its deadline: two moments say nothing about the
 tail of a distribution so far out."""
@@ -137,16 +151,28 @@ def _up_to(estimate: Estimate, deadline: float) -> tuple[float, float, float, fl
     )
 
 
-def is_cause(transition: Transition) -> bool:
-    """Return whether a preemption by this transition is a cause of its own by which a run ends.
+def is_cause(task: Task, transition: Transition) -> bool:
+    """Return whether a preemption by this transition of a flat task is a cause of its own by which
+    a run ends.
 
-    It is one if an event or a timer takes exactly one run: then it has its own distribution of the
-    time since the run began. A transition that fires as soon as its arcs allow it (another run has
-    finished, a token has arrived) only cuts the run short: the net determines when.
+    It is one if an event or a timer takes exactly one run, and whatever else it takes is there as
+    long as the run: then it has its own distribution of the time since the run began. A transition
+    that fires as soon as its arcs allow it (another run has finished, a token has arrived) only
+    cuts the run short: the net determines when. So it does where the event waits for a token.
     """
     runs = [a for a in transition.inputs if a.end is not None]
     waits = bool(transition.events) or transition.after is not None
-    return waits and len(runs) == 1 and runs[0].end is End.PREEMPT
+    if not waits or len(runs) != 1 or runs[0].end is not End.PREEMPT:
+        return False
+    net, run = task.net, task.net.place_index[runs[0].place]
+    changes = [dict(move) for move in net.compiled.changes]
+    return all(
+        net.initial[q] >= a.weight * net.initial[run]
+        and all(c.get(q, 0) >= a.weight * c.get(run, 0) for c in changes)
+        for a in transition.inputs
+        if a is not runs[0]
+        for q in (net.place_index[a.place],)
+    )
 
 
 def branching_places(task: Task, transition: Transition) -> set[tuple[str, End | None]]:
@@ -333,6 +359,12 @@ class Numbers:
     def wait(self, event: str) -> float:
         """Return the mean time (s) until an event comes. Raises NoEstimate."""
         mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
+        if mean is None and self._from_ready(event):
+            self.assumptions.append(
+                f"{event}: when a run raises it was neither measured nor declared; taken to be "
+                "before all else that its transitions need (add mean_wait, or measure again)"
+            )
+            return SHORTEST
         if mean is None:
             raise NoEstimate(
                 f"events.{event}: its mean wait is unknown: neither measured nor declared; add "
@@ -341,3 +373,24 @@ class Numbers:
         if event not in self.measured.waits:
             self.assumptions.append(f"{event}: mean wait declared in the task file, not measured")
         return mean
+
+    def waits_ready(self, x: CompiledTransition) -> bool:
+        """Return whether the wait of a transition for its internal event is known from when it has
+        all else, as measured waits are. A declared one is known from the begin of the run."""
+        asked = [a for a in x.actions if a.raised]
+        preempts = all(a.end is End.PREEMPT and not a.takes_done for a in asked)
+        t = self.task.transitions[x.name]
+        return bool(asked) and len(t.events) == 1 and preempts and self._from_ready(t.events[0])
+
+    def _from_ready(self, event: str) -> bool:
+        if event in self.measured.waits:
+            return True
+        undeclared = self.task.events[event].mean_wait is None
+        moves = [t for t in self.task.transitions.values() if event in t.events]
+        return (
+            undeclared
+            and bool(self.measured.runs)
+            and self.task.events[event].scope is Scope.INTERNAL
+            and all(any(a.end is End.PREEMPT for a in t.inputs) for t in moves)
+            and not any(is_cause(self.task, t) for t in moves)
+        )

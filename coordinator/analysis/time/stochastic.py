@@ -388,6 +388,8 @@ class _Derivation:
         self.doubts: list[str] = []
         self.by: dict[tuple[str, str], str] = {}
         self.compiled = {x.name: x for x in compile_transitions(task)}
+        self.ready = {x.name for x in self.compiled.values() if self.numbers.waits_ready(x)}
+        """Transitions whose wait for an internal event begins when they have all else."""
         self.domains = condition_domains(task)
         self.conditions = {
             t.name: with_values(t.when, dict(task.parameters))
@@ -523,7 +525,9 @@ class _Derivation:
         while it is active, then its place says with which it ended."""
         name = place.name
         arcs = [(x.name, a) for x in self.compiled.values() for a in x.actions if a.name == name]
-        events = {e for t, a in arcs if (name, t) not in self.by for e in a.raised}
+        events = {
+            e for t, a in arcs if (name, t) not in self.by and t not in self.ready for e in a.raised
+        }
         self.raised[name] = tuple(sorted(events))
         if events and place.most_active > 1:
             raise ValueError(
@@ -680,7 +684,9 @@ class _Derivation:
         it."""
         name = place.name
         for t in self.task.transitions.values():
-            if is_cause(t) and any(a.place == name for a in t.inputs if a.end is not None):
+            if is_cause(self.task, t) and any(
+                a.place == name for a in t.inputs if a.end is not None
+            ):
                 self.by[name, t.name] = f"{name}.by.{t.name}"
                 self.parts.places[f"{name}.by.{t.name}"] = 0
                 self.phases[name].append(f"{name}.by.{t.name}")
@@ -1105,14 +1111,15 @@ class _Derivation:
             and (arc.takes_done or arc.end is (End.ERROR if s is Status.ERROR else End.NORMAL))
             for kind in self.kinds[p, s]
             for raised in self._sets(p)
-            if set(arc.raised) <= set(raised)
+            if set(arc.raised) <= set(raised) or t.name in self.ready
         ]
         kinds += [going] if arc.end is End.PREEMPT else []
         out: list[tuple[Told, Weights, Weights]] = []
         for chosen in combinations_with_replacement(kinds, w):
             taken = Counter(chosen)
             given = {f"{p}.{_cut(arc.counts)}": taken[going]} if taken[going] else {}
-            flags = {f"{p}.raised {e}": taken[going] for e in arc.raised if taken[going]}
+            asked = () if t.name in self.ready or not taken[going] else arc.raised
+            flags = {f"{p}.raised {e}": taken[going] for e in asked}
             own = [self.told.get(label, {}) for label in chosen]
             told = dict(set(own[0].items()).intersection(*(o.items() for o in own)))
             out.append((told, {p: w, **taken, **flags}, given))
@@ -1131,10 +1138,11 @@ class _Derivation:
         )
 
     def _awaited_event(self, t: Transition) -> str:
-        """Return the external event for which a transition waits once its arcs are satisfied;
-        empty if there is none. (Of several events all but a pulse have places of their own.)"""
+        """Return the event for which a transition waits once its arcs are satisfied; empty if there
+        is none. (Of several events all but a pulse have places of their own.)"""
         events = (self.task.events[e] for e in t.events if e not in self.flags)
-        return next((e.name for e in events if e.scope is Scope.EXTERNAL), "")
+        ready = t.name in self.ready
+        return next((e.name for e in events if e.scope is Scope.EXTERNAL or ready), "")
 
     def _fires(self, t: Transition, name: str, case: _Case) -> None:
         """Add a case: it fires at once, after an exponential wait for its events, or after a
@@ -1210,8 +1218,10 @@ class _Derivation:
         return {u.name for u in others if mine & branching_places(self.task, u)}
 
     def _wait_source(self, event: str) -> str:
-        measured = event in self.measured.waits
-        return "measured mean wait" if measured else "mean wait declared in the task file"
+        if event in self.measured.waits:
+            return "measured mean wait"
+        declared = self.task.events[event].mean_wait is not None
+        return "mean wait declared in the task file" if declared else "assumed not to wait"
 
     def _timer(self, t: Transition, name: str, case: _Case, give: Weights, priority: int) -> None:
         """Add a fixed delay as Erlang phases, counted by tokens in a place of its own.

@@ -78,7 +78,7 @@ class RunVocabulary:
         cutting = [
             t.name
             for t in flat.transitions.values()
-            if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
+            if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(flat, t)
         ]
         actions = dict.fromkeys(a for p in flat.primitive_tasks.values() for a in p.alternatives)
         places = tuple(p.name for p in flat.places.values() if p.kind is Kind.ACTION)
@@ -241,6 +241,10 @@ class Training:
         for i, trial in enumerate(kept):
             for wait in (*trial.waits, *(Waited(t, s) for t in timers for s in _waited(t, trial))):
                 waits.setdefault(wait.transition, []).append((wait, i))
+        for name in _unmeasured(task, waits):
+            # Older tables do not have these waits; `event_doubts` names them.
+            own = [i for i, trial in enumerate(kept) if any(r.taken == name for r in trial.runs)]
+            waits |= {name: [(Waited(name, 0.0, WaitEnd.FIRED), i) for i in own]} if own else {}
         found = {name: _waits(task, name, known) for name, known in waits.items()}
         return cls(
             task,
@@ -253,6 +257,20 @@ class Training:
             cell.periods if cell else {},
             same,
         )
+
+
+def _unmeasured(task: Task, measured: Iterable[str]) -> list[str]:
+    """Return the transitions that preempt when their event and tokens are there, whose waits are
+    neither among the measured ones nor declared."""
+    flat = task.flat
+    return [
+        t.name
+        for t in flat.transitions.values()
+        if t.name not in measured
+        and any(flat.events[e].mean_wait is None for e in t.events)
+        and any(a.end is End.PREEMPT for a in t.inputs)
+        and not is_cause(flat, t)
+    ]
 
 
 def _waits(task: Task, transition: str, known: Sequence[tuple[Waited, int]]) -> Waits | None:
@@ -403,7 +421,7 @@ def _cutting_timers(task: Task) -> list[str]:
         for t in task.flat.transitions.values()
         if t.after is not None
         and not t.events
-        and not is_cause(t)
+        and not is_cause(task.flat, t)
         and any(a.end is End.PREEMPT for a in t.inputs)
         and all(a.end in (End.PREEMPT, End.NORMAL, End.ERROR) for a in t.inputs)
     ]

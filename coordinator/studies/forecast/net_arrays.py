@@ -142,7 +142,7 @@ def _move(flat: Task, t: Transition, compiled: CompiledTransition) -> Move:
     known = t.when is not None and allowed is None and t.when.names <= known_variables(flat)
     return Move(
         compiled,
-        is_cause(t),
+        is_cause(flat, t),
         bool(t.events) or t.after is not None,
         memory_of(flat, t),
         max(means) if means and len(means) == len(waits_known) else None,
@@ -159,7 +159,7 @@ def _refuse_unknown_preemption(task: Task, t: Transition) -> None:
     the one run that it takes."""
     runs = [a for a in t.inputs if a.end is not None]
     several = [a for a in runs if a.end is End.PREEMPT and task.places[a.place].most_active > 1]
-    if is_cause(t) and several:
+    if is_cause(task, t) and several:
         place = task.places[several[0].place]
         raise ValueError(
             f"transitions.{t.name}: it preempts a run of {place.name}, which has servers = "
@@ -167,7 +167,7 @@ def _refuse_unknown_preemption(task: Task, t: Transition) -> None:
             "preempted; forecast a copy of the task with servers = 1 there, where further runs "
             "wait, or run a campaign of the task"
         )
-    if is_cause(t) or not any(a.end is End.PREEMPT for a in runs):
+    if is_cause(task, t) or not any(a.end is End.PREEMPT for a in runs):
         return
     if reads_variables(task, t) and not any(a.end in (End.NORMAL, End.ERROR) for a in runs):
         raise ValueError(
@@ -175,7 +175,7 @@ def _refuse_unknown_preemption(task: Task, t: Transition) -> None:
             "forecasts know no variables; let it take "
             "the ended run that sets them, too, or raise an event instead"
         )
-    if t.events:
+    if t.events and len(runs) > 1:
         places = ", ".join(a.place for a in runs)
         raise ValueError(
             f"transitions.{t.name}: forecasts know an event that preempts one run, this one "

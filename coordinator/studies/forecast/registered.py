@@ -25,7 +25,7 @@ from petrobot.coordinator.learning.propagation import ChoiceShares, limits_of, m
 from petrobot.coordinator.studies.campaign.observed import context_of, observation
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
-from petrobot.coordinator.studies.forecast.predict import NET, Request, predict
+from petrobot.coordinator.studies.forecast.predict import NET, TRIALS, Request, predict
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.services.host.json_text import finite, json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
@@ -84,6 +84,8 @@ def register(
                     apart=by_place(trainings[name]),
                     changes=request.changes,
                 )
+                if unlike := unlike_trials(regimes[name], regimes[name]["gspn"]):
+                    regimes[name]["gspn"]["doubts"] = unlike
                 doubts = contradictions(regimes[name], regimes[name]["gspn"])
                 if doubts and not _views_miss(trainings[name], estimates, name, cell):
                     regimes[name]["doubts"] += doubts
@@ -215,9 +217,34 @@ def contradictions(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str
     tells which of them is right: by more than fitted durations explain."""
     # the view does not know what a choice does to the runs of other places
     tested = said["whole"] and (said["asked"] or (said["same"] and not said.get("what_if")))
-    if said["from"] != NET or tested or "why" in view:
+    if said["from"] != NET or tested:
         return []
-    out = []
+    return [
+        f"{name} is {value:.4g} by the simulated net, but {other:.4g} by the stochastic view, and "
+        "no trial tells which is right; run a campaign of this form"
+        for name, value, other in _apart(said, view)
+    ]
+
+
+def unlike_trials(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str]:
+    """Return in words which figures of the stochastic view the trials contradict, from which the
+    figures of the forecast come."""
+    if said["from"] != TRIALS:
+        return []
+    return [
+        f"{name} is {value:.4g} by the trials, but {other:.4g} by the stochastic view: one of its "
+        "assumptions does not hold here, so do not rely on it in `analyse`, `simulate` or a "
+        "what-if; the figures above are those of the trials"
+        for name, value, other in _apart(said, view)
+    ]
+
+
+def _apart(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[tuple[str, float, float]]:
+    """Return the figures (name, own value, that of the view) that differ by more than fitted
+    durations explain."""
+    out = list[tuple[str, float, float]]()
+    if "why" in view:
+        return out
     for name in ("R_goal", "P_complete", "mean"):
         figure, other = said["figures"].get(name), view[name]
         if figure is None or other is None or figure["value"] is None:
@@ -225,10 +252,7 @@ def contradictions(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str
         value, (low, high) = figure["value"], figure["confidence"]
         limit = CONTRADICTS_TIME * value if name == "mean" else CONTRADICTS_SHARE
         if abs(other - value) > limit and not low <= other <= high:
-            out.append(
-                f"{name} is {value:.4g} by the simulated net, but {other:.4g} by the stochastic "
-                "view, and no trial tells which is right; run a campaign of this form"
-            )
+            out.append((name, value, other))
     return out
 
 

@@ -367,15 +367,21 @@ def event_doubts(training: Training) -> list[str]:
     never = exclusive_places(flat.net, place_semiflows(flat.net))
     place = flat.net.place_index
     cut = {w.transition for trial in training.trials for w in trial.waits if w.end is WaitEnd.CUT}
+    seen = {w.transition for trial in training.trials for w in trial.waits}
     out, together = list[str](), dict[str, dict[str, None]]()
     for t in flat.transitions.values():
         remembered = memory_of(flat, t)
-        if t.name in cut and remembered is None:
+        if t.name in cut and remembered is None and len(t.events) > 1:
             out.append(
                 f"{t.name} waits for several events, and its waits were interrupted: which of them "
                 "had come by then is not known"
             )
         known = training.waits.get(t.name)
+        if known is not None and t.events and t.name not in seen:
+            out.append(
+                f"{t.name}: how long it waits for {' and '.join(t.events)} was not measured; taken "
+                "to be no time; run a campaign again, or declare mean_wait"
+            )
         by_rate = known is not None and known.came is not None
         if remembered is None or (training.repeats and not by_rate):
             continue

@@ -259,7 +259,9 @@ out = ["idle"]
     [
         ("", 'event = "bell"', True),
         ("", "after = 1.0", True),
-        (', "idle"', 'event = "bell"', True),
+        (', "idle"', 'event = "bell"', False),  # it is taken while the run is active
+        (', "armed"', 'event = "bell"', True),
+        (', "armed"', "after = 1.0", True),
         (', "idle"', "", False),
         (', "locate:normal"', "", False),
         (', "locate:normal"', "after = 1.0", False),
@@ -268,9 +270,12 @@ out = ["idle"]
 def test_causes_of_end_are_events_and_timers_that_take_one_run(
     more: str, how: str, cause: bool
 ) -> None:
-    """All other preemptions follow from the marking."""
-    task = loads(ONE_WAY + EVENTS.format(more=more, how=how), "scan.toml")
-    assert is_cause(task.flat.transitions["rung"]) is cause
+    """All other preemptions follow from the marking. `armed` is there as long as the run."""
+    armed = ONE_WAY.replace('out = ["watch"', 'out = ["armed", "watch"')
+    armed = armed.replace("[transitions", "[places.armed]\n[transitions", 1)
+    text = armed if "armed" in more else ONE_WAY
+    task = loads(text + EVENTS.format(more=more, how=how), "scan.toml")
+    assert is_cause(task.flat, task.flat.transitions["rung"]) is cause
     move = next(m for m in Structure.of(task).moves if m.name == "rung")
     assert move.cause is cause
 

@@ -16,7 +16,7 @@ from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.play import Played
 from petrobot.coordinator.studies.forecast.predict import Request, predict
-from petrobot.coordinator.studies.forecast.registered import contradictions
+from petrobot.coordinator.studies.forecast.registered import contradictions, unlike_trials
 from petrobot.coordinator.studies.forecast.residual import (
     doubts,
     measured,
@@ -25,6 +25,7 @@ from petrobot.coordinator.studies.forecast.residual import (
     residuals,
     routing,
 )
+from petrobot.coordinator.studies.forecast.tables import _exact_lines
 from petrobot.coordinator.task.file import loads
 from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
@@ -263,3 +264,9 @@ def test_two_views_that_contradict_each_other_are_doubtful_where_no_trial_tells(
     assert not contradictions(said, values | other), "the trials tell"
     assert not contradictions(said | {"asked": ["a"]}, values | other), "the view does not know"
     assert not contradictions(said | untested, {"why": "not solved"})
+    assert not unlike_trials(said, values | other), "the figures are not those of the trials"
+    wrong = unlike_trials(said | {"from": "trials"}, values | other)
+    assert all(words in text for text, words in zip(wrong, contradicts, strict=True))
+    view = {**values, **other, "markings": 3, "P_complete_interval": None, "doubts": wrong}
+    shown = [line for line in _exact_lines(view) if "DOUBTFUL: " in line]
+    assert len(shown) == len(contradicts)
