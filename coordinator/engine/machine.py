@@ -333,9 +333,9 @@ class Engine:
             settle(draft, self.policy, "RunRaised")
 
     def _event_occurred(self, draft: Draft, stimulus: EventOccurred) -> None:
+        if stimulus.is_repeated(draft.seen):
+            return
         if stimulus.number:
-            if stimulus.number <= draft.seen.get(stimulus.source, 0):
-                return
             draft.seen[stimulus.source] = stimulus.number
         self._occur(draft, stimulus.event, "EventOccurred")
 

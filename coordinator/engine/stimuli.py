@@ -88,6 +88,11 @@ class EventOccurred:
     source: str = ""
     number: int = 0
 
+    def is_repeated(self, seen: Mapping[str, int]) -> bool:
+        """Whether it was accepted before: a source delivers again what a coordinator that died may
+        not have received. `seen`: by source, the number of the newest event accepted."""
+        return 0 < self.number <= seen.get(self.source, 0)
+
 
 @dataclass(frozen=True, slots=True)
 class TimerFired:

@@ -116,6 +116,8 @@ def unserved(step: RecordedStep, engine: Engine) -> str:
         return ""
     if any(isinstance(one, Fired | Choose | Report) for one in step.instructions):
         return ""
+    if step.repeated:
+        return "delivered again, ignored"
     event = step.stimulus.event
     if event in step.state.flags:
         return "kept until a transition takes it"

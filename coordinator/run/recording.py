@@ -22,6 +22,7 @@ import msgpack
 
 from petrobot.coordinator.engine import (
     Engine,
+    EventOccurred,
     Instruction,
     State,
     Stimulus,
@@ -265,6 +266,8 @@ class RecordedStep:
     state: State
     boots: Mapping[str, str]
     """The boot of each node that was in use then."""
+    repeated: bool = False
+    """Whether it is an event that had been accepted before, and so is ignored."""
 
 
 def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
@@ -299,9 +302,11 @@ def replay(journal: Journal, engine: Engine) -> Iterator[RecordedStep]:
             raise JournalError(
                 f"{journal.path}: record {record.number} holds no stimulus: {fault}"
             ) from fault
+        again = isinstance(stimulus, EventOccurred) and stimulus.is_repeated(state.seen)
         state, instructions = engine.handle(state, stimulus)
         _compare(journal.path, record.number, record.data, engine, state, instructions)
-        yield RecordedStep(record.number, record.data["t"], stimulus, instructions, state, boots)
+        t = record.data["t"]
+        yield RecordedStep(record.number, t, stimulus, instructions, state, boots, again)
 
 
 def _compare(
