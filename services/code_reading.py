@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from importlib.util import decode_source
 from pathlib import Path
 from types import CodeType
 from typing import Any, get_args, get_type_hints
@@ -489,7 +490,7 @@ def _undefined(code: _Code, seen: _Seen) -> None:
 def _bound(file: str) -> frozenset[str]:
     """Return the global names that a file binds anywhere, also under a condition. What a function
     or class binds is its own, unless it says `global`."""
-    top = symtable.symtable(Path(file).read_bytes(), file, "exec")
+    top = symtable.symtable(decode_source(Path(file).read_bytes()), file, "exec")
     found = {one.get_name() for one in top.get_symbols() if one.is_local()}
     inner = top.get_children()
     for table in inner:

@@ -162,7 +162,8 @@ def test_an_event_that_is_delivered_again_is_not_shown_as_another(
     press, path = EventOccurred("press", "button", 1), tmp_path / "run.journal"
     with closing(JournalWriter(path, HEADER)) as writer:
         store, state = JournalStore(writer, 0.0), engine.initial()
-        for i, stimulus in enumerate((Begin(), press, press, replace(press, number=2))):
+        story: tuple[Stimulus, ...] = (Begin(), press, press, replace(press, number=2))
+        for i, stimulus in enumerate(story):
             state, instructions = engine.handle(state, stimulus)
             store.append(i, stimulus, instructions, state)
     assert main(["log", str(path)]) == 0
