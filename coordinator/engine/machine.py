@@ -328,8 +328,9 @@ class Engine:
                 "primitive task; ignored"
             )
             _warn(draft, "unknown_event", text, stimulus.event)
-        else:
-            draft.put(run, raised=run.raised | {stimulus.event})
+        elif not stimulus.is_repeated(run):
+            heard = max(run.heard, stimulus.number)
+            draft.put(run, raised=run.raised | {stimulus.event}, heard=heard)
             settle(draft, self.policy, "RunRaised")
 
     def _event_occurred(self, draft: Draft, stimulus: EventOccurred) -> None:

@@ -24,6 +24,7 @@ from petrobot.coordinator.engine import (
     Engine,
     EventOccurred,
     Instruction,
+    RunRaised,
     State,
     Stimulus,
     stimulus_from_plain,
@@ -303,6 +304,8 @@ def replay(journal: Journal, engine: Engine) -> Iterator[RecordedStep]:
                 f"{journal.path}: record {record.number} holds no stimulus: {fault}"
             ) from fault
         again = isinstance(stimulus, EventOccurred) and stimulus.is_repeated(state.seen)
+        if isinstance(stimulus, RunRaised) and (run := state.run(stimulus.run)) is not None:
+            again = stimulus.is_repeated(run)
         state, instructions = engine.handle(state, stimulus)
         _compare(journal.path, record.number, record.data, engine, state, instructions)
         t = record.data["t"]

@@ -175,6 +175,24 @@ def test_an_event_that_is_delivered_again_is_not_shown_as_another(
     assert [line.get("repeated", False) for line in lines] == [False, False, True, False]
 
 
+def test_an_event_of_a_run_that_is_delivered_again_fires_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A transition that leaves the run active has consumed it already."""
+    engine = Engine(loads(TASK, "desk.toml"))
+    stuck, path = RunRaised("carrying#1", "stuck", 1), tmp_path / "run.journal"
+    with closing(JournalWriter(path, HEADER)) as writer:
+        store, state = JournalStore(writer, 0.0), engine.initial()
+        begin: tuple[Stimulus, ...] = (Begin(), Chosen("carrying#1", "carry"))
+        for i, stimulus in enumerate((*begin, stuck, stuck, replace(stuck, number=2), stuck)):
+            state, instructions = engine.handle(state, stimulus)
+            store.append(i, stimulus, instructions, state)
+    assert main(["log", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("fired     hindered") == 2
+    assert shown.count("raised by carrying#1: delivered again, ignored") == 2
+
+
 def test_a_report_has_the_times_of_the_log(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
