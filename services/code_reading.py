@@ -19,11 +19,13 @@ import inspect
 import json
 import os
 import random
+import symtable
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from importlib.util import decode_source
 from pathlib import Path
 from types import CodeType
 from typing import Any, get_args, get_type_hints
@@ -486,15 +488,14 @@ def _undefined(code: _Code, seen: _Seen) -> None:
 
 @cache
 def _bound(file: str) -> frozenset[str]:
-    """Return all names that a file binds anywhere, also under a condition."""
-    found = set[str]()
-    for node in _nodes_of_file(file):
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            found.add(node.id)
-        elif isinstance(node, ast.alias):
-            found.add((node.asname or node.name).partition(".")[0])
-        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            found.add(node.name)
+    """Return the global names that a file binds anywhere, also under a condition. What a function
+    or class binds is its own, unless it says `global`."""
+    top = symtable.symtable(decode_source(Path(file).read_bytes()), file, "exec")
+    found = {one.get_name() for one in top.get_symbols() if one.is_local()}
+    inner = top.get_children()
+    for table in inner:
+        inner += table.get_children()
+        found |= {one.get_name() for one in table.get_symbols() if one.is_declared_global()}
     return frozenset(found)
 
 

@@ -372,15 +372,15 @@ class _Check:
                     raise _too_long(back, seconds)
                 self.rest()  # with its drives on, unlike before
                 self.movements(there, back, seconds)
-            if len(commands) < 2:
-                self.note("stop and hold during a movement: give two commands, there and back")
-            else:
+            if len(commands) > 1:
                 if len(self.unheld) == 1 and True in self.unheld:  # in every movement
                     self.fault(
                         f"hold: answered 'held', and {dict(self.unheld[True])} went on to its end; "
                         "obey it (`paused`), or if it brakes until then, give longer commands"
                     )
                 self.limits(commands[0], commands[1], seconds)
+            elif type(self.driver).command is not Driver.command:  # a sensor refuses them all
+                self.note("stop and hold during a movement: give two commands, there and back")
         if cable is None:
             self.note("a pulled cable: give `cable`")
         else:

@@ -385,6 +385,8 @@ def _task_line(found: Mapping[str, Any], wide: int) -> list[str]:
         for name in ("R_conj", "C", "J")
         if found.get(name) is not None
     ]
+    if found.get("R_conj") is not None:
+        shown[0] += " (every run a SUCCESS)"
     where = f" in {found['regime']}, where it is hardest" if found.get("regime") else ""
     return [f"  {'the task':{wide}}{'  '.join(shown)}{where}"] if shown else []
 

@@ -254,7 +254,8 @@ def _cause(step: RecordedStep, engine: Engine) -> Iterator[tuple[str, str, str]]
             how = ("raised by the operator", unserved(step, engine))
             yield "event", event, ": ".join(filter(None, how))
         case RunRaised(run, event):
-            yield "event", event, f"raised by {run}"
+            how = (f"raised by {run}", unserved(step, engine))
+            yield "event", event, ": ".join(filter(None, how))
         case ForceExit(of) | Override(of):
             yield "operator", of, text
         case SetBreakpoints():

@@ -328,14 +328,15 @@ class Engine:
                 "primitive task; ignored"
             )
             _warn(draft, "unknown_event", text, stimulus.event)
-        else:
-            draft.put(run, raised=run.raised | {stimulus.event})
+        elif not stimulus.is_repeated(run):
+            heard = max(run.heard, stimulus.number)
+            draft.put(run, raised=run.raised | {stimulus.event}, heard=heard)
             settle(draft, self.policy, "RunRaised")
 
     def _event_occurred(self, draft: Draft, stimulus: EventOccurred) -> None:
+        if stimulus.is_repeated(draft.seen):
+            return
         if stimulus.number:
-            if stimulus.number <= draft.seen.get(stimulus.source, 0):
-                return
             draft.seen[stimulus.source] = stimulus.number
         self._occur(draft, stimulus.event, "EventOccurred")
 

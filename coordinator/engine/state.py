@@ -82,6 +82,8 @@ class Run:
     """Number of its end among all ends; the lowest is taken first."""
     raised: frozenset[str] = frozenset()
     """Internal events that it raised and that no firing has consumed."""
+    heard: int = 0
+    """Number of the newest of its events that was accepted."""
     counts: Counts | None = None
     """How it counts after its cancellation."""
     reason: str = ""

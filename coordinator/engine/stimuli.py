@@ -6,8 +6,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 from petrobot.coordinator.task import Executed, Status, Value
+
+if TYPE_CHECKING:
+    from petrobot.coordinator.engine.state import Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,12 @@ class RunRaised:
 
     run: str
     event: str
+    number: int = 0
+    """Number that its node gave it; 0 without one, as in older journals."""
+
+    def is_repeated(self, run: Run) -> bool:
+        """Whether this run raised it before: see `EventOccurred.is_repeated`."""
+        return 0 < self.number <= run.heard
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +97,11 @@ class EventOccurred:
     event: str
     source: str = ""
     number: int = 0
+
+    def is_repeated(self, seen: Mapping[str, int]) -> bool:
+        """Whether it was accepted before: a source delivers again what a coordinator that died may
+        not have received. `seen`: by source, the number of the newest event accepted."""
+        return 0 < self.number <= seen.get(self.source, 0)
 
 
 @dataclass(frozen=True, slots=True)

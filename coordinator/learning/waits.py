@@ -54,8 +54,8 @@ class EventWaits:
         """Note which transitions an event finds waiting."""
         if not isinstance(stimulus, EventOccurred | RaiseEvent):
             return
-        if isinstance(stimulus, EventOccurred) and stimulus.number:
-            if stimulus.number <= self._seen.get(stimulus.source, 0):
+        if isinstance(stimulus, EventOccurred):
+            if stimulus.is_repeated(self._seen):
                 return
             self._seen[stimulus.source] = stimulus.number
         for name in [*self._since]:

@@ -110,8 +110,10 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
 
 
 def unserved(step: RecordedStep, engine: Engine) -> str:
-    """Return why an external event fired nothing when it came; empty if it did, if a report says
+    """Return why an event fired nothing when it came; empty if it did, if a report says
     why, or if a choice has to be made first."""
+    if step.repeated:
+        return "delivered again, ignored"
     if not isinstance(step.stimulus, EventOccurred | RaiseEvent) or step.state.suspended:
         return ""
     if any(isinstance(one, Fired | Choose | Report) for one in step.instructions):

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from petrobot.coordinator.run.folder import DEFAULT, NoRunError, journal_of
 from petrobot.services.host.json_text import json_text
+from petrobot.services.host.parent_death import state_of
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 ADDRESS_FILE = "operator.json"
@@ -94,10 +95,11 @@ def _newest_first(folder: Path) -> list[Path]:
 
 
 def _read(path: Path) -> RunAddress | None:
-    """Return the address in a file; None if there is none, or if its coordinator has ended."""
+    """Return the address in a file; None if there is none, or if its coordinator has ended. One
+    that was killed keeps its number until the process that started it asks for its end."""
     try:
         address = RunAddress(**json.loads(path.read_text(encoding="utf-8")))
         os.kill(address.process, 0)
     except (OSError, ValueError, TypeError):
         return None
-    return address
+    return None if state_of(address.process) == "Z" else address

@@ -136,6 +136,10 @@ class ChangePublisher:
         if isinstance(stimulus, Chosen):
             self._why[stimulus.key] = stimulus.reason
         elif isinstance(stimulus, (EventOccurred, RaiseEvent)):
+            if isinstance(stimulus, EventOccurred) and stimulus.is_repeated(
+                self._seen.seen if self._seen else {}
+            ):
+                return
             known = self.feed.state["events"].get(stimulus.event)
             if known is not None:
                 event = {**known, "count": known["count"] + 1, "last": round(time, 4)}

@@ -363,7 +363,7 @@ class Executor:
         elif event.run:
             run = self.dispatch.run_of(event.run)
             if run is not None:
-                self._queue.append(RunRaised(run, event.name))
+                self._queue.append(RunRaised(run, event.name, event.number))
         elif event.name in self._external and (
             event.number or self.engine.awaits(self.state, event.name)
         ):

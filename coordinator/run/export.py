@@ -45,6 +45,8 @@ def jsonl(journal: Journal, steps: Iterator[RecordedStep]) -> Iterator[str]:
             "instructions": [to_plain(instruction) for instruction in step.instructions],
             "marking": list(step.state.marking),
         }
+        if step.repeated:
+            line["repeated"] = True
         yield json_text(line, ensure_ascii=False)
 
 

@@ -22,7 +22,9 @@ import msgpack
 
 from petrobot.coordinator.engine import (
     Engine,
+    EventOccurred,
     Instruction,
+    RunRaised,
     State,
     Stimulus,
     stimulus_from_plain,
@@ -265,6 +267,8 @@ class RecordedStep:
     state: State
     boots: Mapping[str, str]
     """The boot of each node that was in use then."""
+    repeated: bool = False
+    """Whether it is an event that had been accepted before, and so is ignored."""
 
 
 def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
@@ -299,9 +303,13 @@ def replay(journal: Journal, engine: Engine) -> Iterator[RecordedStep]:
             raise JournalError(
                 f"{journal.path}: record {record.number} holds no stimulus: {fault}"
             ) from fault
+        again = isinstance(stimulus, EventOccurred) and stimulus.is_repeated(state.seen)
+        if isinstance(stimulus, RunRaised) and (run := state.run(stimulus.run)) is not None:
+            again = stimulus.is_repeated(run)
         state, instructions = engine.handle(state, stimulus)
         _compare(journal.path, record.number, record.data, engine, state, instructions)
-        yield RecordedStep(record.number, record.data["t"], stimulus, instructions, state, boots)
+        t = record.data["t"]
+        yield RecordedStep(record.number, t, stimulus, instructions, state, boots, again)
 
 
 def _compare(

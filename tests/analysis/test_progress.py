@@ -1170,10 +1170,17 @@ tired = { in = ["wave:error"], out = ["ready"] }
 """
 
 
-def test_an_event_that_is_served_after_an_error_does_not_stop_the_mission() -> None:
-    """`pressed` waits for the arm, which `spilled` gives back in the same step in which the mission
-    is lost."""
-    found = judged(loads(KEPT))
+@pytest.mark.parametrize("end", ["error", "failure"])
+def test_an_event_that_is_served_when_the_mission_is_lost_does_not_stop_it(end: str) -> None:
+    """`pressed` waits for the arm, which the transition gives back by which the mission is lost:
+    after an ERROR, or after another end that alone leads to `final_error`."""
+    text = KEPT
+    if end == "failure":
+        good, bad = (f"""when = 'load.status {sign} "success"' }}""" for sign in ("==", "!="))
+        spilt = f'spilt = {{ in = ["load:normal"], out = ["broken"], {bad}'
+        old = 'loaded = { in = ["load:normal"] }'
+        text = text.replace(old, f"{old[:-2]}, {good}\n{spilt}")
+    found = judged(loads(text))
     assert found.sound.holds, found.sound.reason
 
 

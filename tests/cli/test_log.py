@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +152,45 @@ def test_equal_events_one_after_the_other_are_counted(
         kept,
         "the same 2 times more, until 95.000 s",
     ]
+
+
+def test_an_event_that_is_delivered_again_is_not_shown_as_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The node delivers again what a coordinator that was killed may not have received."""
+    engine = Engine(loads(TASK, "desk.toml"))
+    press, path = EventOccurred("press", "button", 1), tmp_path / "run.journal"
+    with closing(JournalWriter(path, HEADER)) as writer:
+        store, state = JournalStore(writer, 0.0), engine.initial()
+        story: tuple[Stimulus, ...] = (Begin(), press, press, replace(press, number=2))
+        for i, stimulus in enumerate(story):
+            state, instructions = engine.handle(state, stimulus)
+            store.append(i, stimulus, instructions, state)
+    assert main(["log", str(path)]) == 0
+    shown = [line[47:] for line in capsys.readouterr().out.splitlines() if "press" in line]
+    kept = "from button: kept until a transition takes it"
+    assert [line.strip() for line in shown] == [kept, "from button: delivered again, ignored", kept]
+    assert main(["log", str(path), "--format", "jsonl"]) == 0
+    lines = map(json.loads, capsys.readouterr().out.splitlines()[1:])
+    assert [line.get("repeated", False) for line in lines] == [False, False, True, False]
+
+
+def test_an_event_of_a_run_that_is_delivered_again_fires_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A transition that leaves the run active has consumed it already."""
+    engine = Engine(loads(TASK, "desk.toml"))
+    stuck, path = RunRaised("carrying#1", "stuck", 1), tmp_path / "run.journal"
+    with closing(JournalWriter(path, HEADER)) as writer:
+        store, state = JournalStore(writer, 0.0), engine.initial()
+        begin: tuple[Stimulus, ...] = (Begin(), Chosen("carrying#1", "carry"))
+        for i, stimulus in enumerate((*begin, stuck, stuck, replace(stuck, number=2), stuck)):
+            state, instructions = engine.handle(state, stimulus)
+            store.append(i, stimulus, instructions, state)
+    assert main(["log", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("fired     hindered") == 2
+    assert shown.count("raised by carrying#1: delivered again, ignored") == 2
 
 
 def test_a_report_has_the_times_of_the_log(

@@ -606,6 +606,12 @@ IN_THE_CODE: list[Mistake] = [
     (
         CODE,
         "    return success()",
+        "    return success(was=mine)\n\n\ndef other() -> int:\n    mine = 1\n    return mine",
+        r"arm_bot.py:\d+: `mine` is not defined; .* it",
+    ),
+    (
+        CODE,
+        "    return success()",
         "    await ctx.sleep(0.1)",
         r"arm_bot.py:\d+: grip returns no result here; end it with `return success\(\)`",
     ),

@@ -30,6 +30,7 @@ from petrobot.coordinator.run.folder import JOURNAL, NoRunError
 from petrobot.coordinator.run.journal import JournalError, JournalWriter, read_journal
 from petrobot.coordinator.run.recording import JournalStore, remarks
 from petrobot.services.comm.location_file import load
+from petrobot.services.host.parent_death import state_of
 from tests.cli.cell import TASK
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import PATIENCE_S, beat, until
@@ -539,18 +540,24 @@ def test_without_a_run_every_command_says_so(
 
 @pytest.mark.processes
 @pytest.mark.parametrize("named", [[], ["--run", "tidy-1"]])
-def test_of_a_run_whose_coordinator_died_it_says_how_to_continue(
-    named: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("asked", [True, False])
+async def test_of_a_run_whose_coordinator_died_it_says_how_to_continue(
+    asked: bool, named: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It was killed, so its address is still there."""
+    """It was killed, so its address is still there; its parent may not have asked for its end, so
+    that its process number is still there too."""
     gone = subprocess.Popen(["true"])
-    gone.wait()
+    await until(lambda: state_of(gone.pid) == "Z")
+    if asked:
+        gone.wait()
     folder = tmp_path / "tidy-1"
     folder.mkdir()
     address = {"run": "tidy-1", "url": "", "token": "", "process": gone.pid}
     (folder / ADDRESS_FILE).write_text(json.dumps(address))
     (folder / JOURNAL).write_text("")
-    assert main(["pause", *named, "--journal", str(tmp_path)]) == 2
+    pause = ["pause", *named, "--journal", str(tmp_path)]
+    assert await asyncio.to_thread(main, pause) == 2
+    gone.wait()
     told = "tidy-1 was interrupted: `petrobot resume tidy-1` continues it"
     assert told in capsys.readouterr().err
 

@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any, ClassVar, cast
 
 import pytest
@@ -724,6 +725,20 @@ def test_a_cable_that_is_pulled_and_put_back(kind: type[Axis], faults: list[str]
 
     found = checked(kind, cable=cable)
     assert found.faults == faults and not found.notes
+
+
+class Button(Driver):
+    """A sensor, which has no movement that could be stopped or held."""
+
+    period = 0.1
+
+
+def test_a_sensor_is_asked_for_no_commands() -> None:
+    asked = "give two commands, there and back"
+    for kind, wanted in ((Button, False), (Axis, True)):
+        made = partial(kind, {}, cast(Ports, None))
+        found = check_driver(made, simulated=True)
+        assert found.faults == [] and (asked in "; ".join(found.notes)) is wanted
 
 
 def test_a_driver_without_cycles_has_no_movements_to_check() -> None:

@@ -14,7 +14,7 @@ the beginning, so that a dead end far away is found.
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import cycle
@@ -281,6 +281,17 @@ class ExecutionGraph:
         number = self.index[core, *self.names.rest(after), _reports(said, TIMELESS)]
         step = self._numbers.get(Step(cause.text, _fired(said), cause.stimulus), -1)
         return after, said, number, self._edges.get((state, number, step), -1)
+
+    def had_not_come(self, events: Set[str], state: int, step: Step) -> int | None:
+        """Return the number of the state after the stimulus of a step from a state if these events
+        had not come before; None if it was not found."""
+        before, orders = self.states[state], self.orders[state]
+        cause = next(c for c in self.names.stimuli(before, orders) if c.text == step.text)
+        before = replace(before, flags=before.flags - events)
+        after, said = self.engine.handle(before, cause.stimulus)
+        orders = self.names.next_orders(before, orders, after)
+        core = self.shared.number(self.names.core(after, orders), after)
+        return self.index.get((core, *self.names.rest(after), _reports(said, TIMELESS)))
 
     @cached_property
     def _numbers(self) -> dict[Step, int]:

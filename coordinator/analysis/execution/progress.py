@@ -342,23 +342,39 @@ class Progress:
         marks, found, free = self._marks(awaiting), set[str](), (self._nominal & can)[x.source]
         for n in np.unique(x.label[free]).tolist():
             found |= marks.intersection(x.steps[n].firings)
-        # After a run that ended in ERROR, an event that was kept may be served in the same step.
-        for n in np.unique(x.label[free & ~x.fails & lost[x.target]]).tolist():
+        into = free & ~x.fails & lost[x.target]
+        for n in np.unique(x.label[into]).tolist():
             cause = x.steps[n].stimulus
             came = cause.event if isinstance(cause, EventOccurred) else None
-            fired = x.steps[n].firings
-            found |= {name for name in awaiting if name in fired or came in awaiting[name]}
+            found |= {name for name, some in awaiting.items() if came in some}
+        found |= self._blamed(into, awaiting, lost)
         # After these the task gives up unless another event comes in time.
         events = x.firing(awaiting)
         quiet = x.of_edges(~x.fails & ~events)
         doomed = quiet.backward(x.given_up) & ~quiet.backward(good)
         able = quiet.backward(x.final) | ~quiet.backward(x.given_up | ~x.expanded)
         into = free & events & ~x.fails & able[x.source] & doomed[x.target]
-        fired = (set(x.steps[n].firings) for n in np.unique(x.label[into]).tolist())
-        maybe = set[str]().union(*fired) & set(awaiting)
+        maybe = self._blamed(into, awaiting, lost | doomed)
         # Those that `final` needs anyhow are no stops.
         spared = x.of_edges(~x.firing(maybe)).backward(x.final)[x.source]
         return frozenset(found | {t for t in maybe if (into & spared & x.firing([t])).any()})
+
+    def _blamed(self, edges: Mask, awaiting: Mapping[str, set[str]], bad: Mask) -> set[str]:
+        """Return the transitions fired on these edges, which lead to bad states, that are to blame:
+        had their event not come, the edge would lead to a good one.
+
+        An event that was kept is served in any later step: also in that of a run whose end alone
+        leads to `final_error`.
+        """
+        x, found = self.x, set[str]()
+        for n in np.unique(x.label[edges]).tolist():
+            cause, sources = x.steps[n].stimulus, x.source[edges & (x.label == n)].tolist()
+            came = {cause.event} if isinstance(cause, EventOccurred) else set[str]()
+            for name in awaiting.keys() & set(x.steps[n].firings) - found:
+                others = (x.had_not_come(awaiting[name], i, x.steps[n]) for i in sources)
+                if came & awaiting[name] or any(o is None or not bad[o] for o in others):
+                    found.add(name)
+        return found
 
     def _marks(self, awaiting: Iterable[str]) -> set[str]:
         """Return those of the transitions that only fill places which nothing else empties and
