@@ -245,14 +245,16 @@ def alike(was: Any, now: Any) -> bool:
 
 
 def unmeasured(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record without what differs between two equal runs: measured times, and a score's
-    own words."""
+    """Return a record without what differs between two equal runs: measured times, a score's own
+    words, and the number of an event that a run raised, which older journals do not have."""
     plain: dict[str, Any] = msgpack.unpackb(
         msgpack.packb(dict(data), use_bin_type=True), raw=False, strict_map_key=False
     )
     plain.pop("values", None)
     if isinstance(plain.get("stimulus"), dict):
         plain["stimulus"].pop("cpu_seconds", None)
+        if plain["stimulus"].get("kind") == RunRaised.__name__:
+            plain["stimulus"].pop("number", None)
     return plain
 
 

@@ -83,13 +83,15 @@ def test_a_changed_script_is_noticed(
     assert len(read_journal(recorded_run / JOURNAL).records) == 20
 
 
-def test_measured_processor_time_is_not_compared(tmp_path: Path) -> None:
+def test_what_older_journals_lack_and_measured_times_are_not_compared(tmp_path: Path) -> None:
     path = tmp_path / "run.journal"
     writer = JournalWriter(path, {"mode": "lockstep"})
     writer.append("stage", {"stage": "scored", "values": {"cpu_s": 1.0}})
     writer.append(
         "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.25}}
     )
+    raised = {"kind": "RunRaised", "run": "b#1", "event": "full"}
+    writer.append("stimulus", {"t": 2.0, "stimulus": raised})
     writer.close()
     store = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ValueError, match="try again when it has caught up"):
@@ -98,6 +100,7 @@ def test_measured_processor_time_is_not_compared(tmp_path: Path) -> None:
     store.record(
         "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.5}}
     )
+    store.record("stimulus", {"t": 2.0, "stimulus": {**raised, "number": 7}})
     compared = store.safe
     store.record("stage", {"stage": "other", "values": {}})
     assert (compared, store.safe) == (True, False), (
