@@ -96,7 +96,7 @@ def _newest_first(folder: Path) -> list[Path]:
 
 def _read(path: Path) -> RunAddress | None:
     """Return the address in a file; None if there is none, or if its coordinator has ended. One
-    that was killed keeps its number until the process that started it asks for its end."""
+    that was killed keeps its process id until its parent collects it."""
     try:
         address = RunAddress(**json.loads(path.read_text(encoding="utf-8")))
         os.kill(address.process, 0)

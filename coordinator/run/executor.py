@@ -195,7 +195,7 @@ class Executor:
         self._work(now)
 
     def synced(self, now: float) -> None:
-        """The sync that `in_background` was given has ended: let leave what waited for it."""
+        """The sync that `in_background` was given has ended: carry out what waited for it."""
         assert self._syncing is not None
         (effects, then), self._syncing = self._syncing, None
         # What was stopped or held before it began must not move for as long as another sync takes.
@@ -203,7 +203,7 @@ class Executor:
         held &= {e.run for e in effects if isinstance(e, StartRun)}
         behind = [e for e in effects if isinstance(e, _Order) and e.run in held]
         self._effects[:0] = behind
-        self._let_leave(now, [e for e in effects if e not in behind])
+        self._carry_out(now, [e for e in effects if e not in behind])
         for call in then:
             call(now)
         self._work(now)
@@ -222,9 +222,9 @@ class Executor:
             effects = self._safe_effects(now)
             if not effects:
                 return
-            self._let_leave(now, effects)
+            self._carry_out(now, effects)
 
-    def _let_leave(self, now: float, effects: Iterable[Instruction]) -> None:
+    def _carry_out(self, now: float, effects: Iterable[Instruction]) -> None:
         for instruction in effects:
             stopping = isinstance(instruction, _Order) and instruction.run in self.state.stopping
             if isinstance(instruction, StartRun if stopping else CancelRun):

@@ -77,8 +77,7 @@ class JournalWriter:
         self._at = path.absolute()  # an action in this process may change the working directory
         self._buffer = bytearray()
         self._written = self._durable = 0
-        """How often records were handed to the operating system, and how many of these times are
-        durable."""
+        """How many times records were written to the file, and how many of these are durable."""
         self._torn: int | None = None
         """Where to cut the file before anything is appended; None: nowhere."""
         self._syncing = Lock()

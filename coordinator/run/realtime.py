@@ -90,9 +90,9 @@ class Punctuality:
 
 
 SLOW_DISK: Final = 0.3
-"""From this duration of a sync on the result says that the disk is slow (s)."""
+"""If a sync takes so long (s), the result says that the disk is slow."""
 DISK_PATIENCE: Final = 60.0
-"""From this duration of a sync on the run ends: the disk does not answer (s)."""
+"""If a sync takes so long (s), the run ends: the disk does not answer."""
 LINGER = 1.0
 """Longest wait for anything at the end of a run (s)."""
 ASK_AGAIN: Final = 0.2
@@ -359,8 +359,8 @@ class RealtimeMission:
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
 
     def _sync(self, work: Callable[[], None]) -> None:
-        """Make the journal durable in a thread. It ends with the process, not the other way: the
-        disk may never answer."""
+        """Make the journal durable in a thread. A daemon: a disk that never answers must not keep
+        the process from its end."""
         loop, began = self._loop, self.now()
         done = loop.create_future()
         text = f"the disk of the journal has not answered for {DISK_PATIENCE:g} s"

@@ -19,7 +19,7 @@ def snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None
 
 
 def _snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None:
-    from snakes.nets import (  # type: ignore[import-not-found]
+    from snakes.nets import (
         Inhibitor,
         MultiArc,
         PetriNet,
@@ -59,8 +59,8 @@ def pm4py_markings(text: str, net: Net) -> set[tuple[int, ...]]:
     rule."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import pm4py  # type: ignore[import-not-found]
-        from pm4py.objects.petri_net import semantics  # type: ignore[import-not-found]
+        import pm4py
+        from pm4py.objects.petri_net import semantics
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "net.pnml"
@@ -92,7 +92,7 @@ def storm_time(text: str, label: str) -> float:
 
 
 def _storm(text: str, asked: str) -> float:
-    import stormpy  # type: ignore[import-not-found]
+    import stormpy
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "chain.drn"

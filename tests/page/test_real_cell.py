@@ -175,7 +175,7 @@ async def lead_by_hand(tab: Tab, shots: Path) -> None:
     await tab.screenshot(path=shots / "serve-paused.png")
     await toolbar.get_by_role("button", name="Step").click()
     await expect(fired).to_have_count(2)
-    await expect(toolbar).to_contain_text("Paused after one firing")
+    await expect(tab.locator(".pause-note")).to_contain_text("Paused after one firing")
     await toolbar.get_by_role("button", name="Continue").click()
     await expect(mission).to_contain_text("Success")
     why = fired.filter(has_text="slipped").first

@@ -108,7 +108,7 @@ def verdicts_ours(name: str) -> dict[str, Any]:
 
 def space_snakes(name: str) -> dict[str, Any]:
     """Explore a net with SNAKES; stop after SLOW_STATES markings."""
-    from snakes.nets import MultiArc, PetriNet, Place, StateGraph, Transition, Value, dot  # type: ignore[import-not-found]
+    from snakes.nets import MultiArc, PetriNet, Place, StateGraph, Transition, Value, dot
 
     net, model = SPACES[name](), PetriNet("net")
     for p, place in enumerate(net.places):
@@ -131,9 +131,9 @@ def space_snakes(name: str) -> dict[str, Any]:
 
 def space_pm4py(name: str) -> dict[str, Any]:
     """Explore a net with pm4py's own semantics; stop after SLOW_STATES markings."""
-    from pm4py.objects.petri_net import semantics  # type: ignore[import-not-found]
-    from pm4py.objects.petri_net.obj import Marking, PetriNet  # type: ignore[import-not-found]
-    from pm4py.objects.petri_net.utils import petri_utils  # type: ignore[import-not-found]
+    from pm4py.objects.petri_net import semantics
+    from pm4py.objects.petri_net.obj import Marking, PetriNet
+    from pm4py.objects.petri_net.utils import petri_utils
 
     net, model, first = SPACES[name](), PetriNet("net"), Marking()
     places = [PetriNet.Place(p) for p in net.places]
@@ -165,7 +165,7 @@ def space_pm4py(name: str) -> dict[str, Any]:
 
 def storm_model(net: Net, rates: dict[str, float]) -> Any:
     """Return a GSPN as a model of Storm."""
-    from stormpy import gspn  # type: ignore[import-not-found]
+    from stormpy import gspn
 
     builder = getattr(gspn, "GspnBuilder", None) or gspn.GSPNBuilder  # renamed in stormpy 2
     builder = builder()

@@ -5,8 +5,8 @@ import json
 import sys
 import time
 
-import dashboard_client  # type: ignore[import-not-found]
-import rtde_receive  # type: ignore[import-not-found]
+import dashboard_client
+import rtde_receive
 
 HOST = sys.argv[1]
 FIELDS = ["timestamp", "actual_q", "robot_mode", "safety_mode", "runtime_state"]

@@ -180,10 +180,9 @@ export class NetView {
       const side = ground.settle(element); // again: the first ones did not know where the last ones would be
       const [x, y, below, anchor] = labelAt(element, side);
       const { label, sub } = element.parts;
-      attribute(label, "x", x);
       attribute(label, "y", y);
-      attribute(sub, "x", x);
       attribute(sub, "y", side === "below" || side === "above" || element.shape === "place" ? below : y - 14);
+      for (const node of [label, sub]) attribute(node, "x", x);
       for (const node of [label, sub]) attribute(node, "text-anchor", anchor);
     }
   }
