@@ -364,8 +364,8 @@ class RealtimeMission:
         loop, began = self._loop, self.now()
         done = loop.create_future()
         text = (
-            f"the disk of the journal has not answered for {DISK_PATIENCE:g} s; nothing was sent on "
-            "the strength of its last records; `petrobot resume` continues when it answers again"
+            f"the disk of the journal has not answered for {DISK_PATIENCE:g} s; nothing was sent "
+            "on the strength of its last records; `petrobot resume` continues when it answers again"
         )
         patience = loop.call_at(began + DISK_PATIENCE, self.fail, JournalError(text))
 
