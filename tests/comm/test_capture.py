@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -181,6 +182,29 @@ def test_images_that_nobody_wants_are_taken_and_dropped(device: type[Device]) ->
     began = time.monotonic()
     images.start(30.0)
     assert wait_for(images.newest, awaited="an image").time >= began
+    images.close()
+
+
+def test_an_image_that_was_taken_before_the_start_is_dropped(device: type[Device]) -> None:
+    """It was still being converted when somebody else wanted images from now on."""
+    clock = itertools.count()
+    images = CaptureImages(0, lambda: float(next(clock)))
+    calls = itertools.count()
+    again: list[float] = []
+    retrieve = device.retrieve
+
+    def meanwhile(self: Device) -> tuple[bool, np.ndarray]:
+        if next(calls) == 1:
+            images.stop()
+            again.append(float(next(clock)))
+            images.start(30.0)
+        return retrieve(self)
+
+    device.retrieve = meanwhile  # type: ignore[method-assign]
+    images.start(30.0)
+    wait_for(lambda: again, awaited="the second start")
+    image: Image = wait_for(images.newest, awaited="an image")
+    assert image.time > again[0]
     images.close()
 
 

@@ -71,6 +71,7 @@ class CaptureImages:
         self._newest: Image | None = None
         self._sequence = 0
         self._rate = 0.0
+        self._began = 0.0
         self._fault = ""
         self._tried = threading.Event()
         self._ended = threading.Event()
@@ -86,6 +87,7 @@ class CaptureImages:
         ConnectionError with the source and the reason while it gives none."""
         with self._lock:
             self._newest, self._sequence, self._rate = None, 0, rate
+            self._began = self._clock()
         if self._thread is None:
             self._tried.clear()
             self._ended.clear()
@@ -148,7 +150,7 @@ class CaptureImages:
         """Take images until the camera is lost or closed; return how many came."""
         count = 0
         while not ended.is_set() and capture.grab():
-            time = self._clock() - self._settings.latency
+            grabbed = self._clock()
             if self._rate:
                 taken, pixels = capture.retrieve()
                 if not taken:
@@ -156,7 +158,8 @@ class CaptureImages:
                 if not self._settings.colour:
                     pixels = grey(pixels)
                 with self._lock:
-                    if self._rate:
+                    if self._rate and grabbed >= self._began:
+                        time = grabbed - self._settings.latency
                         self._newest = Image(pixels, time, self._sequence)
                         self._sequence += 1
             count += 1
