@@ -431,26 +431,14 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
     lines = [p.label or p.name]
     if p.kind is Kind.ACTION and p.task != p.name:
         lines.append(f"({p.task})")
-    if short := _in_short(p):
-        lines.append(short)
+    if p.in_short:
+        lines.append(p.in_short)
     capacity = f", at most {p.capacity}" if p.capacity is not None else ""
     hint = f"{p.name}: {what}{capacity}"
     style = f"place {p.kind}" + (" error" if p.name in task.error_elements else "")
     return DrawnNode(
         p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden
     )
-
-
-def _in_short(p: Place) -> str:
-    """Return what the short forms of the place declare, which the drawing does not show as net
-    elements."""
-    parts = (
-        f"{p.tries} tries" if p.tries > 1 else "",
-        f"{p.timeout:g} s" if p.timeout is not None else "",
-        f"holds {listed(p.holds)}" if p.holds else "",
-        "listens" if p.listen else "",
-    )
-    return ", ".join(filter(None, parts))
 
 
 def _transition_node(

@@ -22,13 +22,24 @@ from petrobot.coordinator.task.expansion import with_error_branches
 
 def picture(task: Task) -> dict[str, Any]:
     """Return the snapshot's `task`: the flat net (with the names used in markings and firings) and
-    its macro places. `made_from` of an element names the short form that it was made from, which is
-    drawn instead. An exit that `[errors]` adds has none: it is drawn, as `petrobot show` does it.
-    Conditions are those of the file, without what short forms add to them."""
+    its macro places.
+
+    What short forms add is not drawn: elements with `made_from` (the element that they were made
+    from) and arcs with `made`. Instead, `in_short` is written at the place. An exit that `[errors]`
+    adds is drawn, as `petrobot show` does it. Conditions are those of the file, without what short
+    forms add to them."""
     flat = task.flat
     errors = flat.error_elements
-    macros = dict(_macros(task, task.places, ""))
-    written = dict(_written(task, ""))
+    nets = list(_nets(task, ""))
+    places = {prefix + p.name: (p, prefix) for prefix, net in nets for p in net.places.values()}
+    written = {
+        prefix + t.name: replace(t, expanded_from="")
+        for prefix, net in nets
+        for t in net.transitions.values()
+    }
+    originals = {
+        name: written.get(name) or _made(t, written) for name, t in flat.transitions.items()
+    }
     return {
         "name": task.name,
         "text": task.text,
@@ -38,39 +49,33 @@ def picture(task: Task) -> dict[str, Any]:
         "primitive_tasks": {name: _primitive_task(p) for name, p in task.primitive_tasks.items()},
         "events": {name: _event(e) for name, e in task.events.items()},
         "places": [
-            *(_place(p, p.name in errors) for p in flat.places.values()),
             *(
-                {**_place(p, False), "name": name, "in_macro": around}
-                for name, (p, around) in macros.items()
+                _place(p, p.name in errors, places[name][0] if name in places else p)
+                for name, p in flat.places.items()
+            ),
+            *(
+                {
+                    **_place(p, False, p),
+                    "name": name,
+                    "in_macro": prefix + p.macro if p.macro else prefix.removesuffix("."),
+                }
+                for name, (p, prefix) in places.items()
+                if p.kind is Kind.MACRO
             ),
         ],
         "transitions": [
-            _transition(t, written.get(t.name) or _made(t, written), flat, t.name in errors)
+            _transition(t, originals[t.name], flat, t.name in errors)
             for t in flat.transitions.values()
         ],
-        "arcs": [arc for t in flat.transitions.values() for arc in _arcs(t)],
+        "arcs": [arc for t in flat.transitions.values() for arc in _arcs(t, originals[t.name])],
     }
 
 
-def _macros(
-    task: Task, places: Mapping[str, Place], prefix: str
-) -> Iterator[tuple[str, tuple[Place, str]]]:
-    """Return each macro place by its full name, with the full name of the one around it."""
-    for place in places.values():
-        if place.kind is Kind.MACRO:
-            around = prefix + place.macro if place.macro else prefix.removesuffix(".")
-            yield prefix + place.name, (place, around)
-            if place.subnet:
-                yield from _macros(
-                    task, task.subnets[place.subnet].places, f"{prefix}{place.name}."
-                )
-
-
-def _written(net: Task, prefix: str) -> Iterator[tuple[str, Transition]]:
-    """Return each transition of the file, and each exit that `[errors]` adds, by its full name."""
+def _nets(net: Task, prefix: str) -> Iterator[tuple[str, Task]]:
+    """Return the net of the file and those of its macro places, with the exits that `[errors]`
+    adds, each with the prefix of its names."""
     net = with_error_branches(net)
-    for t in net.transitions.values():
-        yield prefix + t.name, replace(t, expanded_from="")
+    yield prefix, net
     for place in net.places.values():
         if place.subnet:
             subnet = net.subnets[place.subnet]
@@ -80,7 +85,7 @@ def _written(net: Task, prefix: str) -> Iterator[tuple[str, Transition]]:
                 transitions=subnet.transitions,
                 errors_to=subnet.errors_lead_to,
             )
-            yield from _written(inner, f"{prefix}{place.name}.")
+            yield from _nets(inner, f"{prefix}{place.name}.")
 
 
 def _made(t: Transition, written: Mapping[str, Transition]) -> Transition:
@@ -89,7 +94,7 @@ def _made(t: Transition, written: Mapping[str, Transition]) -> Transition:
     return replace(t, expanded_from=origin) if origin in written else t
 
 
-def _place(place: Place, error: bool) -> dict[str, Any]:
+def _place(place: Place, error: bool, written: Place) -> dict[str, Any]:
     return {
         "name": place.name,
         "kind": place.kind.value,
@@ -101,6 +106,7 @@ def _place(place: Place, error: bool) -> dict[str, Any]:
         "tokens": place.tokens,
         "capacity": place.capacity,
         "servers": place.servers,
+        "in_short": written.in_short,
         "primitive_task": place.task,
         "subnet": place.subnet,
         "args": {
@@ -134,18 +140,20 @@ def _event_words(name: str, task: Task) -> dict[str, str]:
     return {"name": name, "scope": event.scope.value if event else Scope.EXTERNAL.value}
 
 
-def _arcs(transition: Transition) -> Iterator[dict[str, Any]]:
-    def arc(direction: str, place: str, weight: int, **more: Any) -> dict[str, Any]:
-        ends = {"place": place, "transition": transition.name}
-        return {**ends, "direction": direction, "weight": weight, **more}
+def _arcs(transition: Transition, written: Transition) -> Iterator[dict[str, Any]]:
+    """Return the arcs: those of the file come first, then those that short forms add."""
 
-    for one in transition.inputs:
+    def arc(direction: str, place: str, weight: int, made: bool, **more: Any) -> dict[str, Any]:
+        ends = {"place": place, "transition": transition.name}
+        return {**ends, "direction": direction, "weight": weight, "made": made, **more}
+
+    for i, one in enumerate(transition.inputs):
         end, counts = one.end and one.end.value, one.counts and one.counts.value
-        yield arc("in", one.place, one.weight, end=end, counts=counts)
-    for out in transition.outputs:
-        yield arc("out", out.place, out.weight)
-    for stop in transition.inhibitors:
-        yield arc("inhibit", stop.place, stop.threshold)
+        yield arc("in", one.place, one.weight, i >= len(written.inputs), end=end, counts=counts)
+    for i, out in enumerate(transition.outputs):
+        yield arc("out", out.place, out.weight, i >= len(written.outputs))
+    for i, stop in enumerate(transition.inhibitors):
+        yield arc("inhibit", stop.place, stop.threshold, i >= len(written.inhibitors))
 
 
 def _primitive_task(task: PrimitiveTask) -> dict[str, Any]:

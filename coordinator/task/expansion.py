@@ -266,9 +266,11 @@ def _in_scope(t: Transition, scope: _Scope) -> Transition:
 
 def _rewired(transition: Transition, entries: Mapping[str, Subnet]) -> Transition:
     """Return the transition with its arcs to and from macro places moved to the subnets' entry and
-    exit places."""
+    exit places. It stays of an error branch: a subnet may fail without an error of an action."""
+    after_error = any(a.place in entries and a.end is End.ERROR for a in transition.inputs)
     return replace(
         transition,
+        error_branch=transition.error_branch or after_error,
         inputs=tuple(_from(a, entries) for a in transition.inputs),
         outputs=tuple(_to(a, entries) for a in transition.outputs),
     )

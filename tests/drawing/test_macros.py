@@ -13,7 +13,12 @@ from petrobot.coordinator.drawing import Overlay, draw
 from petrobot.coordinator.drawing.scene import scene_of_task, sheet_of
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.task.file import TaskFileError, dumps, loads
+from petrobot.coordinator.task.file import TaskFileError, dumps, load, loads
+
+SHIPPED = [
+    *sorted(Path("coordinator/tasks").glob("*.toml")),
+    *(path for path in sorted(Path("examples").glob("*/*.toml")) if path.stem != "services"),
+]
 
 TEXT = """
 schema = 1
@@ -226,6 +231,67 @@ def test_the_page_draws_what_errors_adds_and_no_condition_that_the_file_lacks() 
     assert not any(made[name]["when"] for name in drawn)
     assert made["read.error.1"]["made_from"] == "read.error"
     assert made["seen.1"]["made_from"] == "seen" and made["read.retry"]["made_from"] == "read"
+
+
+@pytest.mark.parametrize("text", ["ADDED_EXITS", "HELD", *map(str, SHIPPED)])
+def test_the_page_draws_the_arcs_and_error_branches_that_show_draws(text: str) -> None:
+    """What `holds` takes and gives back is written under the place, in both drawings."""
+    task = loads(globals()[text]) if text in globals() else load(Path(text))
+    scene, page = scene_of_task(task, True, None, None), picture(task)
+    made = {e["name"] for kind in ("places", "transitions") for e in page[kind] if e["made_from"]}
+    drawn = {
+        (scene.shown.get(a["place"], a["place"]), a["transition"], a["direction"] == "out")
+        for a in page["arcs"]
+        if not a["made"] and a["place"] not in made and a["transition"] in scene.nodes
+    }
+    there = {
+        (a.target, a.source, True)
+        if scene.nodes[a.target].is_place
+        else (a.source, a.target, False)
+        for a in scene.arcs
+    }
+    assert drawn == there
+    errors = {t["name"] for t in page["transitions"] if t["error"]} & set(scene.nodes)
+    exits = {n for n, node in scene.nodes.items() if not node.is_place and "error" in node.style}
+    assert errors == exits
+    told = {p["name"]: p["in_short"] for p in page["places"] if not p["in_macro"]}
+    for name, words in told.items():
+        assert name in made or not words or words in scene.nodes[name].lines
+
+
+HELD = """schema = 1
+[task]
+name = "held"
+final = "jobs == 1"
+[errors]
+to = "hurt"
+[primitive_tasks]
+grip = { deadline = 9.0 }
+[places]
+jobs = { kind = "control", tokens = 1 }
+arm = { kind = "resource", tokens = 1 }
+grip = { kind = "action", tries = 2, holds = "arm" }
+fetch = { kind = "macro", subnet = "go", args = { tool = "arm" } }
+hurt = {}
+[transitions]
+begin = { in = ["jobs"], out = ["grip"] }
+gripped = { in = ["grip:normal"], out = ["fetch"] }
+fetched = { in = ["fetch:normal"], out = ["jobs"] }
+cleared = { in = ["hurt", "arm"], out = ["jobs", "arm"] }
+[subnets.go]
+entry = "grip"
+normal = "there"
+error = "failed"
+parameters = { tool = "place" }
+[subnets.go.places]
+grip = { kind = "action", holds = "tool", timeout = 5.0 }
+there = {}
+failed = {}
+[subnets.go.transitions]
+gripped = { in = ["grip:normal"], out = ["there"] }
+empty = { in = ["grip:normal"], when = "grip.status == 'failure'", out = ["failed"] }
+slipped = { in = ["grip:error"], out = ["failed"] }
+"""
 
 
 ADDED_EXITS = """schema = 1

@@ -67,6 +67,7 @@ export class Selected {
     const facts = [["Tokens", place.capacity ? `${tokens} of ${place.capacity}` : tokens]];
     const left = state.marking[`${place.name}.left`];
     if (left !== undefined && state.task.places.some((p) => p.made_from === place.name)) facts.push(["Tries left", left]);
+    if (place.in_short) facts.push(["Short forms", place.in_short]);
     if (place.primitive_task) facts.push(["Primitive task", words(place.primitive_task)]);
     const given = this.arguments(state, place);
     if (given) facts.push(["Arguments", given]);

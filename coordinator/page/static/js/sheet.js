@@ -11,7 +11,10 @@ export function caption(transition) {
   return parts.join(" · ");
 }
 
-const hintPlace = (p) => [p.name, p.primitive_task && `primitive task ${p.primitive_task}`, p.capacity && `capacity ${p.capacity}`].filter(Boolean).join("\n");
+/** The text under a place: its primitive task, if that has another name, and what its short forms declare. */
+export const underPlace = (p) => [p.kind === "action" && p.primitive_task !== p.name && words(p.primitive_task), p.in_short].filter(Boolean).join(", ");
+
+const hintPlace = (p) => [p.name, p.in_short, p.primitive_task && `primitive task ${p.primitive_task}`, p.capacity && `capacity ${p.capacity}`].filter(Boolean).join("\n");
 const hintTransition = (t) => [t.name, caption(t), t.priority ? `priority ${t.priority}` : ""].filter(Boolean).join("\n");
 
 /** The net with those places marked as error branches, too, that nothing but error branches uses. */
@@ -60,14 +63,14 @@ export function sheetOf(task, inside) {
   };
   const here = (e) => !e.made_from && (e.in_macro ?? "") === inside;
   const made = new Set([...task.places, ...task.transitions].filter((e) => e.made_from).map((e) => e.name));
-  const arcs = task.arcs.filter((a) => !made.has(a.place) && !made.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place) })).filter((a) => a.place);
+  const arcs = task.arcs.filter((a) => !a.made && !made.has(a.place) && !made.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place) })).filter((a) => a.place);
   const joined = new Set(arcs.map((a) => a.transition));
   const outside = (t) => inside && joined.has(t.name) && !around(macros, t.name).includes(inside);
   const transitions = task.transitions.filter((t) => here(t) || outside(t)).map((t) => (here(t) ? t : { ...t, x: undefined, y: undefined, outside: true }));
   const names = new Set(transitions.map((t) => t.name));
   const base = (e) => (e.label ? e : { ...e, label: e.outside ? e.name : !inside ? e.name : e.name.startsWith(`${inside}.`) ? e.name.slice(inside.length + 1) : e.name.split(".").at(-1) });
   return placed(onlyErrors({
-    places: task.places.filter(here).map((p) => base({ ...p, sub: p.kind === "action" && p.primitive_task !== p.name ? words(p.primitive_task) : "", hint: hintPlace(p) })),
+    places: task.places.filter(here).map((p) => base({ ...p, sub: underPlace(p), hint: hintPlace(p) })),
     transitions: transitions.map((t) => base({ ...t, sub: caption(t), hint: hintTransition(t) })),
     arcs: summed(arcs.filter((a) => names.has(a.transition))),
   }));

@@ -15,7 +15,7 @@ import { Inspector } from "./inspector.js";
 import { KeyHelp, Keys } from "./keys.js";
 import { chooseInside } from "./inside.js";
 import { around, groups } from "./macros.js";
-import { HELD, MADE, Model } from "./model.js";
+import { MADE, Model } from "./model.js";
 import { Pointer } from "./pointer.js";
 import { Selection } from "./selection.js";
 import { Toolbox } from "./toolbox.js";
@@ -193,10 +193,6 @@ export class Designer {
     if (!names.size && !arc) return;
     if ([...names, ...(arc ? [arc.transition] : [])].every((name) => !this.model.has(name))) {
       toast("info", MADE);
-      return;
-    }
-    if (arc?.made) {
-      toast("info", HELD);
       return;
     }
     this.model.remove(names, arc ? [arc] : []);

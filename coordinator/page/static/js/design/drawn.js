@@ -1,7 +1,7 @@
 // What of a task file's document is drawn: one sheet's places, transitions and arcs, with what they mean to a reader.
 
 import { words } from "../dom.js";
-import { caption, onlyErrors } from "../sheet.js";
+import { caption, onlyErrors, underPlace } from "../sheet.js";
 import { arcsOf, listed, readArc } from "./arcs.js";
 import { around, drawnAs, groups, within } from "./macros.js";
 
@@ -35,24 +35,14 @@ function withErrorBranches(data, net) {
   return { ...net, transitions: { ...net.transitions, ...Object.fromEntries(made) } };
 }
 
-/** Arcs that `holds` makes: from the resources that the output places of a transition hold and its input places do not, and to those that only its input places hold. */
-function held(net, transition) {
-  const change = new Map();
-  for (const { place, direction, end, weight } of arcsOf(transition)) {
-    if (direction === "inhibit" || end === "going") continue;
-    for (const resource of listed(net.places?.[place]?.holds)) change.set(resource, (change.get(resource) ?? 0) + (direction === "in" ? weight : -weight));
-  }
-  return [...change].filter(([, n]) => n).map(([place, n]) => ({ place, end: null, counts: null, weight: Math.abs(n), inhibit: false, text: place, direction: n > 0 ? "out" : "in", made: true }));
-}
-
 /** Arcs of the drawn transitions; those that end in one macro place alike are one, with their weights summed. */
 function arcs(net, transitions, shown) {
   const joined = new Map();
   for (const { name } of transitions) {
-    for (const arc of [...arcsOf(net.transitions[name]), ...held(net, net.transitions[name])]) {
+    for (const arc of arcsOf(net.transitions[name])) {
       if (!shown.has(arc.place)) continue;
       const as = shown.get(arc.place);
-      const id = as === arc.place ? `${arc.direction}|${arc.text}|${name}${arc.made ? "|holds" : ""}` : `${arc.direction}|${as}:${arc.end ?? ""}|${name}`;
+      const id = as === arc.place ? `${arc.direction}|${arc.text}|${name}` : `${arc.direction}|${as}:${arc.end ?? ""}|${name}`;
       const before = joined.get(id);
       const inner = as === arc.place ? [] : [...(before?.inner ?? []), arc.place];
       joined.set(id, { ...arc, id, transition: name, place: as, weight: arc.weight + (before?.weight ?? 0), inner });
@@ -61,12 +51,15 @@ function arcs(net, transitions, shown) {
   return [...joined.values()];
 }
 
+/** What the short forms of a place declare, as `Place.in_short` words it. */
+const inShort = (p) => [p.tries > 1 && `${p.tries} tries`, p.timeout !== undefined && `${p.timeout} s`, listed(p.holds).length && `holds ${listed(p.holds).join(", ")}`, p.listen && "listens"].filter(Boolean).join(", ");
+
 function placeOf(data, net, name, p, errors) {
-  const subs = { action: p.task && p.task !== name ? p.task : "", macro: p.subnet ?? "" };
   const inside = groups(p) ? within(net, name) : [];
   const isError = errors.has(name) || (inside.some((n) => errors.has(n)) && inside.every((n) => errors.has(n) || groups(net.places?.[n])));
   const hint = inside.length ? `${name}\nholds ${inside.join(", ")}` : name;
-  return { name, kind: p.kind ?? "plain", label: p.label ?? "", x: p.x, y: p.y, tokens: tokensIn(data, net, name), sub: words(subs[p.kind] ?? ""), error: isError, hint };
+  const sub = [p.kind === "macro" && words(p.subnet ?? ""), underPlace({ name, kind: p.kind, primitive_task: p.task ?? name, in_short: inShort(p) })].filter(Boolean).join(", ");
+  return { name, kind: p.kind ?? "plain", label: p.label ?? "", x: p.x, y: p.y, tokens: tokensIn(data, net, name), sub, error: isError, hint };
 }
 
 function transitionOf(data, name, t, error, outside) {

@@ -7,7 +7,7 @@ import { align, distribute, layOut } from "./arrange.js";
 import { events, variables } from "./declared.js";
 import { actionsOf, scopeOf, taskOf } from "./drawn.js";
 import { around, groups, within } from "./macros.js";
-import { HELD, MADE } from "./model.js";
+import { MADE } from "./model.js";
 import { readValue, writeValue } from "./values.js";
 
 const KINDS = ["plain", "action", "resource", "control", "macro"];
@@ -46,7 +46,6 @@ export class Inspector {
     const [name] = selection.names;
     const chosen = selection.arc?.transition ?? (selection.names.size === 1 ? name : null);
     if (chosen && !this.model.has(chosen)) fill(this.root, [this.head("Transition", chosen), h("p", { class: "muted" }, MADE)]);
-    else if (selection.arc?.made) fill(this.root, [this.head("Arc", selection.arc.place), h("p", { class: "muted" }, HELD)]);
     else if (selection.arc) fill(this.root, this.arc(selection.arc));
     else if (selection.names.size > 1) fill(this.root, this.several(selection.names));
     else if (name && this.model.place(name)) fill(this.root, this.place(name, this.model.place(name)));

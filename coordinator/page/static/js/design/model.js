@@ -6,7 +6,6 @@ import { around, group, groups, members, own, ungroup, within } from "./macros.j
 
 const UNDO_KEPT = 300;
 /** What to do about a transition that only the table `errors` makes. */
-export const HELD = "This arc is made by the key holds of the places at its transition. To change it, change what these places hold in the file.";
 export const MADE = "This error branch is made by the table errors of the file. To draw another one, choose its place and press Add error branch.";
 const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
 
