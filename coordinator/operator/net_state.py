@@ -9,7 +9,6 @@ from typing import Any
 
 from petrobot.coordinator.task import (
     Event,
-    Kind,
     Place,
     PrimitiveTask,
     Reference,
@@ -50,18 +49,14 @@ def picture(task: Task) -> dict[str, Any]:
         "events": {name: _event(e) for name, e in task.events.items()},
         "places": [
             *(
-                _place(p, p.name in errors, places[name][0] if name in places else p)
-                for name, p in flat.places.items()
-            ),
-            *(
                 {
-                    **_place(p, False, p),
+                    **_place(flat.places.get(name, p), p, name in errors),
                     "name": name,
                     "in_macro": prefix + p.macro if p.macro else prefix.removesuffix("."),
                 }
                 for name, (p, prefix) in places.items()
-                if p.kind is Kind.MACRO
             ),
+            *(_place(p, p, False) for name, p in flat.places.items() if name not in places),
         ],
         "transitions": [
             _transition(t, originals[t.name], flat, t.name in errors)
@@ -94,7 +89,7 @@ def _made(t: Transition, written: Mapping[str, Transition]) -> Transition:
     return replace(t, expanded_from=origin) if origin in written else t
 
 
-def _place(place: Place, error: bool, written: Place) -> dict[str, Any]:
+def _place(place: Place, written: Place, error: bool) -> dict[str, Any]:
     return {
         "name": place.name,
         "kind": place.kind.value,
@@ -148,8 +143,12 @@ def _arcs(transition: Transition, written: Transition) -> Iterator[dict[str, Any
         return {**ends, "direction": direction, "weight": weight, "made": made, **more}
 
     for i, one in enumerate(transition.inputs):
-        end, counts = one.end and one.end.value, one.counts and one.counts.value
-        yield arc("in", one.place, one.weight, i >= len(written.inputs), end=end, counts=counts)
+        made = i >= len(written.inputs)
+        # an arc out of a macro place begins, unfolded, at a place of its subnet
+        macro_end = None if made or one.end is not None else written.inputs[i].end
+        yield arc(
+            "in", one.place, one.weight, made, end=one.end, counts=one.counts, macro_end=macro_end
+        )
     for i, out in enumerate(transition.outputs):
         yield arc("out", out.place, out.weight, i >= len(written.outputs))
     for i, stop in enumerate(transition.inhibitors):

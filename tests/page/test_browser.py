@@ -4,8 +4,10 @@ why something failed."""
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,13 @@ from hypothesis import Phase, given, settings
 from tools.bench.hmi import SyntheticMission, ticking
 
 from petrobot.coordinator.operator.changes import apply, empty_state
+from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.page.sessions import Session
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
 from petrobot.coordinator.task import Executed, Status
-from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.file import load, loads
+from tests.drawing.test_macros import HELD, SHIPPED
 from tests.page.conftest import (
     PATIENCE_MS,
     abort,
@@ -249,6 +253,28 @@ async def test_what_a_short_form_adds_has_a_name_for_people(browser: Browser, pa
     labels = await tab.evaluate(script, task)
     assert labels["has_it"] == labels["has_it.1"] == "has it"
     assert labels["grip.retry"] == "grip: retry"
+
+
+async def test_live_and_design_draw_the_same_net(browser: Browser, page: Page) -> None:
+    """The same elements at the same places with the same words, and the same arcs: the one from the
+    flat net of a run, the other from the file."""
+    tab = await opened(browser, page)
+    script = """async ([picture, file]) => {
+      const { sheetOf } = await import("/page/js/sheet.js");
+      const { drawn } = await import("/page/js/design/drawn.js");
+      const { placed } = await import("/page/js/layout.js");
+      const seen = (e) => [e.name, [e.x, e.y, e.sub, Boolean(e.error)]];
+      const joins = (a) => [a.direction, a.place, a.end ?? "", a.transition, a.weight].join(" ");
+      const told = ({ places, transitions, arcs }) => [
+        Object.fromEntries([...places, ...transitions].map(seen)),
+        arcs.map(joins).sort(),
+      ];
+      return [told(sheetOf(picture, "")), told(placed(drawn(file, file, "")))];
+    }"""
+    for text in (HELD, *(path.read_text() for path in SHIPPED)):
+        task = json.loads(json.dumps(picture(loads(text))))
+        live, design = await tab.evaluate(script, [task, tomllib.loads(text)])
+        assert live == design, task["name"]
 
 
 async def test_firings_of_another_run_are_not_taken_for_those_shown(

@@ -11,8 +11,8 @@ export function caption(transition) {
   return parts.join(" · ");
 }
 
-/** The text under a place: its primitive task, if that has another name, and what its short forms declare. */
-export const underPlace = (p) => [p.kind === "action" && p.primitive_task !== p.name && words(p.primitive_task), p.in_short].filter(Boolean).join(", ");
+/** The text under a place: its subnet, or its primitive task if that has another name, and what its short forms declare. */
+export const underPlace = (p) => [words(p.subnet ?? ""), p.kind === "action" && p.primitive_task !== p.name && words(p.primitive_task), p.in_short].filter(Boolean).join(", ");
 
 const hintPlace = (p) => [p.name, p.in_short, p.primitive_task && `primitive task ${p.primitive_task}`, p.capacity && `capacity ${p.capacity}`].filter(Boolean).join("\n");
 const hintTransition = (t) => [t.name, caption(t), t.priority ? `priority ${t.priority}` : ""].filter(Boolean).join("\n");
@@ -63,7 +63,7 @@ export function sheetOf(task, inside) {
   };
   const here = (e) => !e.made_from && (e.in_macro ?? "") === inside;
   const made = new Set([...task.places, ...task.transitions].filter((e) => e.made_from).map((e) => e.name));
-  const arcs = task.arcs.filter((a) => !a.made && !made.has(a.place) && !made.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place) })).filter((a) => a.place);
+  const arcs = task.arcs.filter((a) => !a.made && !made.has(a.place) && !made.has(a.transition)).map((a) => ({ ...a, place: shownAs(a.place), end: a.end ?? (shownAs(a.place) === a.place ? null : a.macro_end) })).filter((a) => a.place);
   const joined = new Set(arcs.map((a) => a.transition));
   const outside = (t) => inside && joined.has(t.name) && !around(macros, t.name).includes(inside);
   const transitions = task.transitions.filter((t) => here(t) || outside(t)).map((t) => (here(t) ? t : { ...t, x: undefined, y: undefined, outside: true }));

@@ -58,7 +58,7 @@ function placeOf(data, net, name, p, errors) {
   const inside = groups(p) ? within(net, name) : [];
   const isError = errors.has(name) || (inside.some((n) => errors.has(n)) && inside.every((n) => errors.has(n) || groups(net.places?.[n])));
   const hint = inside.length ? `${name}\nholds ${inside.join(", ")}` : name;
-  const sub = [p.kind === "macro" && words(p.subnet ?? ""), underPlace({ name, kind: p.kind, primitive_task: p.task ?? name, in_short: inShort(p) })].filter(Boolean).join(", ");
+  const sub = underPlace({ name, kind: p.kind, subnet: p.subnet, primitive_task: p.task ?? name, in_short: inShort(p) });
   return { name, kind: p.kind ?? "plain", label: p.label ?? "", x: p.x, y: p.y, tokens: tokensIn(data, net, name), sub, error: isError, hint };
 }
 
