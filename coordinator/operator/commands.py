@@ -51,6 +51,8 @@ _log = logging.getLogger(__package__)
 
 ANSWERS = 1.5
 """Time for nodes to answer a pause (s)."""
+JOURNALED = 6.0
+"""Time for the disk to confirm a command (s). With `ANSWERS` it is less than a caller waits."""
 _BEFORE = (Stage.CONNECTING, Stage.PREPARING)
 _MAY_COME_EARLY = (SetBreakpoints, Override)
 """Commands that only configure the run and move nothing."""
@@ -194,7 +196,8 @@ class Operation(Followed):
 
     async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
         paused = self.executor.state.mode is Mode.PAUSED  # then only ask again who holds
-        answer = {"ok": True} if paused else await self._order(Pause(f"by {who}"))
+        order = self._order(Pause(f"by {who}")) if not paused else self._when_safe({"ok": True})
+        answer = await order
         if answer["ok"]:
             with suppress(TimeoutError):
                 async with asyncio.timeout(ANSWERS):
@@ -298,13 +301,25 @@ class Operation(Followed):
         return answer
 
     def _when_safe(self, said: Answer) -> asyncio.Future[Answer]:
-        """Return an answer that is given when all until now is journaled."""
-        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        """Return an answer that is given when all until now is journaled, or a disk that does not
+        answer is the reason that it is not."""
+        loop = asyncio.get_running_loop()
+        answer: asyncio.Future[Answer] = loop.create_future()
+
+        def give(given: Answer) -> None:
+            if not answer.done():
+                answer.set_result(given)
+
+        late = refusal(
+            "journal",
+            f"the disk of the journal has not answered for {JOURNALED:g} s: this is carried out "
+            "when it does, and not before; an emergency stop waits for no disk",
+        )
+        patience = loop.call_later(JOURNALED, give, late)
         self._unanswered.add(answer)
         answer.add_done_callback(self._unanswered.discard)
-        self.executor.when_safe(
-            self.shell.now(), lambda _: None if answer.done() else answer.set_result(said)
-        )
+        answer.add_done_callback(lambda _: patience.cancel())
+        self.executor.when_safe(self.shell.now(), lambda _: give(said))
         self.shell.settle()
         return answer
 

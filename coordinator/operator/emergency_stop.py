@@ -30,7 +30,7 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.security import KeyFileError
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.comm.tls.credentials import Credentials, credentials
-from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
+from petrobot.services.host.emergency_latch import ALL, Cleared, LatchError, latch_of
 
 STOP = EMERGENCY_STOP
 CLEAR = "clear_emergency"
@@ -206,6 +206,7 @@ async def order_all(directory: Directory, verb: str = STOP, *, bus: bool = False
 async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopped:
     stopped = Stopped(node)
     line = None
+    kept = await asyncio.to_thread(_kept, directory, node) if verb == CLEAR else None
     try:
         line = EmergencyLine(directory, node, credentials(directory, COORDINATOR))
     except KeyFileError as fault:  # bus and latch need no key
@@ -231,6 +232,10 @@ async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopp
         if verb == CLEAR and not stopped.answered and not (line and line.reached):
             said, stopped.cleared = await _unlatch(directory, node)
             stopped.latch = f"{stopped.why or 'it does not answer'}; {said}" if said else ""
+        elif stopped.done and kept and kept == await asyncio.to_thread(_kept, directory, node):
+            # The node has not cleared this latch: it runs with another copy of services.toml.
+            said, cleared = await _unlatch(directory, node)
+            stopped.note = "" if cleared else said
     finally:
         if line is not None:
             await line.close()
@@ -299,6 +304,12 @@ async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
     except LatchError as fault:
         return f"not cleared: {fault}", False
     return "its stop is cleared on disk, so its devices accept orders once it runs", True
+
+
+def _kept(directory: Directory, node: str) -> Cleared | None:
+    """Return which clearing the latch of a node of this host saw last; None if it stops nothing."""
+    stopped = node in still_stopped(directory)
+    return latch_of(directory.source, node).cleared if stopped else None
 
 
 def _devices_of(directory: Directory, node: str) -> list[str]:

@@ -23,6 +23,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -36,9 +37,10 @@ from petrobot.coordinator.operator.port import Controls, Feed
 from petrobot.coordinator.operator.run_address import RunAddress, published
 from petrobot.coordinator.run.folder import RESULT
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
+from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import UNSCORED, Mission, MissionError, Stage
-from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of
+from petrobot.coordinator.run.realtime import RealtimeMission, credentials_of, on_disk
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
@@ -148,7 +150,8 @@ class RunSession(ABC):
         try:
             with ExitStack() as until_ended:
                 if self.folder is not None and self.address is not None:
-                    until_ended.enter_context(published(self.folder, self.address))
+                    known = published(self.folder, self.address)
+                    await on_disk(partial(until_ended.enter_context, known))
                 try:
                     await self._lead(watch)
                 except MissionError as fault:
@@ -163,12 +166,12 @@ class RunSession(ABC):
             if self.operation is not None:
                 await self.operation.close()
             await self._leave()
-            self._close_journal()
+            await self._close_journal()
             self._seconds = time.perf_counter() - self._begun
             if self._learning is not None:
                 try:
-                    self._learned = self._saved(self._learning)
-                except (EstimatesError, OSError) as fault:
+                    self._learned = await on_disk(partial(self._saved, self._learning))
+                except (EstimatesError, JournalError, OSError) as fault:
                     if stopped_by is None:
                         raise
                     # What stopped the run is what the caller must hear: a full disk is both.
@@ -184,7 +187,7 @@ class RunSession(ABC):
         if self.operation is not None:
             await self.operation.close()
         await self._leave()
-        self._close_journal()
+        await self._close_journal()
         if self.folder is not None and not self._resumed:
             shutil.rmtree(self.folder, ignore_errors=True)
 
@@ -228,10 +231,10 @@ class RunSession(ABC):
     async def _leave(self) -> None:
         """Close the connections to the nodes."""
 
-    def _close_journal(self) -> None:
+    async def _close_journal(self) -> None:
         store = self.mission.executor.store
         if isinstance(store, JournalStore):
-            store.writer.close()
+            await on_disk(store.writer.close)
 
     def _saved(self, session: LearningSession) -> dict[str, Any]:
         """Save what it learned, also after an interruption; return the part of the result about

@@ -33,7 +33,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import UNSCORED, MissionError
 from petrobot.coordinator.run.node_status import ask_all
-from petrobot.coordinator.run.realtime import UnreachableError
+from petrobot.coordinator.run.realtime import UnreachableError, on_disk
 from petrobot.coordinator.run.recording import ReplayError
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError, loads
@@ -336,7 +336,7 @@ class Station(Followed):
                 self._tell_error(str(fault), str(fault))
             if unscored := run.mission.remarks.get(UNSCORED):
                 self._notice_error(f"no score: {unscored}")
-            await asyncio.to_thread(run.keep_result)
+            await on_disk(run.keep_result)
             self.feed.emit("result", result=run.result())
         except Exception as fault:  # An exception in a run must not end the station.
             reason = f"{type(fault).__name__}: {fault}"

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from shlex import quote
 from threading import Thread
-from typing import Final
+from typing import Final, TypeVar
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
@@ -104,6 +104,40 @@ the leases of a coordinator that left without BYE (`services.comm.calls.callee.R
 TRANSIT: Final = 0.1
 """Longest time that a WELCOME needs on a busy host (s): an order right after the clearing of an
 emergency stop must not count as older. No operator gives and clears a stop in this time."""
+
+
+T = TypeVar("T")
+
+
+def on_disk(work: Callable[[], T]) -> asyncio.Future[T]:
+    """Do what writes to the disk in a thread: a sync may take seconds, in which the nodes and the
+    operators must be answered. The future raises what `work` raises, and JournalError after
+    `DISK_PATIENCE`."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def end(finish: Callable[[], None]) -> None:
+        patience.cancel()
+        if not done.done():
+            finish()
+
+    def in_thread() -> None:
+        try:
+            finish = partial(done.set_result, work())
+        except Exception as fault:
+            finish = partial(done.set_exception, fault)
+        with suppress(RuntimeError):  # the loop was closed, because this took so long
+            loop.call_soon_threadsafe(end, finish)
+
+    text = (
+        f"the disk of the journal has not answered for {DISK_PATIENCE:g} s; nothing was sent on "
+        "the strength of its last records; `petrobot resume` continues when it answers again"
+    )
+    silent = partial(done.set_exception, JournalError(text))
+    patience = loop.call_later(DISK_PATIENCE, end, silent)
+    # A daemon: a disk that never answers must not keep the process from its end.
+    Thread(target=in_thread, name="journal", daemon=True).start()
+    return done
 
 
 class UnreachableError(Exception):
@@ -359,36 +393,12 @@ class RealtimeMission:
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
 
     def _sync(self, work: Callable[[], None]) -> None:
-        """Make the journal durable in a thread. A daemon: a disk that never answers must not keep
-        the process from its end."""
-        loop, began = self._loop, self.now()
-        done = loop.create_future()
-        text = (
-            f"the disk of the journal has not answered for {DISK_PATIENCE:g} s; nothing was sent "
-            "on the strength of its last records; `petrobot resume` continues when it answers again"
-        )
-        patience = loop.call_at(began + DISK_PATIENCE, self.fail, JournalError(text))
+        self._syncing = on_disk(work)
+        self._syncing.add_done_callback(partial(self._synced, self.now()))
 
-        def end(fault: Exception | None) -> None:
-            patience.cancel()
-            done.set_result(None)
-            self._synced(began, fault)
-
-        def sync() -> None:
-            fault = None
-            try:
-                work()
-            except Exception as found:
-                fault = found
-            with suppress(RuntimeError):  # the loop was closed, because this took so long
-                loop.call_soon_threadsafe(end, fault)
-
-        self._syncing = done
-        Thread(target=sync, name="journal", daemon=True).start()
-
-    def _synced(self, began: float, fault: Exception | None) -> None:
+    def _synced(self, began: float, done: asyncio.Future[None]) -> None:
         self._slowest_sync = max(self._slowest_sync, self.now() - began)
-        if fault is not None:
+        if (fault := done.exception()) is not None:
             self.fail(fault)
         elif not self._closed and self._fault is None:
             self._guarded(self.mission.synced)

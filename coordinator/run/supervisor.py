@@ -33,6 +33,7 @@ LAST_WORDS = 0.5
 READY = b"ready"  # what a program prints when others may use it
 LARGEST_LOG = 32 << 20  # of a node (bytes), and as much again in the older part
 LOOK_AT_LOG = 1.0  # pause between looks at its size (s)
+LAST_PART = 1 << 16  # of a log is searched for its last lines (bytes)
 STABLE_AFTER = 10.0  # after this uptime (s) a node starts again without a pause
 
 
@@ -171,14 +172,8 @@ class Supervisor:
         ready.cancel()
         if child.task in done and isinstance(fault := child.task.exception(), OSError):
             raise fault
-        said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
-        tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
-        why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
-        code = child.process.returncode if child.process is not None else None
-        if code is not None and code < 0:
-            why = f"was ended by a signal ({signal.strsignal(-code)})"
-        told = f"ends with:\n{tail}" if tail else "says nothing; start it again"
-        raise LaunchError(f"node {child.program.name} {why}; its log {child.log} {told}")
+        why = "" if child.task in done else f"was not ready after {timeout:g} s"
+        raise LaunchError(f"node {child.program.name} {_end_of(child, why)}")
 
     async def _keep(self, child: _Child) -> None:
         loop, pause = asyncio.get_running_loop(), FIRST_PAUSE
@@ -198,9 +193,9 @@ class Supervisor:
                 if loop.time() - started > STABLE_AFTER
                 else min(2 * pause, LONGEST_PAUSE)
             )
-            name = child.program.name
+            told = _end_of(child, lines=1)
             _log.warning(
-                "node %s died; its log is %s; starting it again in %g s", name, child.log, pause
+                "node %s died: it %s; starting it again in %g s", child.program.name, told, pause
             )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
@@ -233,6 +228,21 @@ class Supervisor:
                 fault = child.log_fault
                 if fault is not None and not child.ready.is_set():
                     raise fault
+
+
+def _end_of(child: _Child, why: str = "", lines: int = 12) -> str:
+    """Return how a program ended, unless `why` says it, and the last lines of its log since it was
+    started: one of them stands in the same line."""
+    code = child.process.returncode if child.process is not None else None
+    if code is not None and code < 0:
+        why = f"was ended by a signal ({signal.strsignal(-code)})"
+    said = b""
+    with contextlib.suppress(OSError), child.log.open("rb") as log:
+        log.seek(max(child.begun_at, log.seek(0, os.SEEK_END) - LAST_PART))
+        said = log.read()
+    tail = said.decode(errors="replace").splitlines()[-lines:]
+    told = ("ends with:", *tail) if tail else ("says nothing; start it again",)
+    return f"{why or 'ended'}; its log {child.log} {(chr(10) if len(tail) > 1 else ' ').join(told)}"
 
 
 def _opened(child: _Child) -> FileIO:

@@ -18,6 +18,7 @@ import pytest
 from petrobot.coordinator.cli import COMMANDS, main
 from petrobot.coordinator.cli.resume import later_run, located
 from petrobot.coordinator.engine import Mode
+from petrobot.coordinator.operator import commands
 from petrobot.coordinator.operator.run_address import (
     ADDRESS_FILE,
     RunAddress,
@@ -197,6 +198,28 @@ async def test_an_emergency_stop_is_answered_before_a_slow_disk(
     finally:
         goes_on.set()
     await asyncio.wait_for(petrobot.running, PATIENCE_S)
+
+
+async def test_a_command_that_a_hung_disk_delays_says_so(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It said only that nobody answered. A second pause was confirmed, though no node had been
+    asked to hold."""
+    goes_on = threading.Event()
+    await petrobot.working()
+    monkeypatch.setattr(commands, "JOURNALED", 0.3)
+    monkeypatch.setattr(os, "fdatasync", lambda _: goes_on.wait(PATIENCE_S))
+    try:
+        for _ in range(2):
+            said = await petrobot("pause")
+            assert said.code == 1 and "the disk of the journal has not answered" in said.err, said
+        assert not petrobot.arm.held
+    finally:
+        goes_on.set()
+    await until(lambda: petrobot.arm.held)
+    assert (await petrobot("pause")).code == 0
+    await petrobot("abort")
+    await petrobot.running
 
 
 async def test_a_disk_that_never_answers_ends_the_run_and_holds_nobody(

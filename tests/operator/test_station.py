@@ -9,6 +9,7 @@ import math
 import os
 import shutil
 import threading
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -208,6 +209,24 @@ async def test_an_emergency_stop_needs_no_run(cell: Cell) -> None:
     assert cell.state["mission"]["state"] == "stopped" and "ben" in cell.state["mission"]["reason"]
     assert (await cell.say("clear_estop"))["ok"]
     assert cell.state["mission"]["state"] == "idle"
+
+
+@pytest.mark.parametrize("ends", [True, False])
+async def test_no_disk_is_waited_for_in_the_event_loop(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch, ends: bool
+) -> None:
+    """The file with the run's address was synced there, when its nodes were already connected: a
+    disk that needs two seconds for it cost every one of them its coordinator."""
+    where = Counter[str]()
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(os, name, lambda _: where.update([threading.current_thread().name]))
+    cell.station.address = lambda run: RunAddress(run, "http://127.0.0.1:1", "token", os.getpid())
+    assert (await cell.say("start", task="moving"))["ok"]
+    await until(lambda: cell.state["mission"]["state"] == "running")
+    if not ends:
+        await cell.say("abort")
+    await cell.ended()
+    assert sum(where.values()) > 5 and threading.main_thread().name not in where, where
 
 
 async def test_a_slow_disk_delays_a_start_and_neither_the_page_nor_a_stop(

@@ -37,7 +37,7 @@ def program(name: str, source: str, first: bool = False) -> Program:
 
 def deaths(caplog: pytest.LogCaptureFixture) -> list[str]:
     """Return the log lines about programs that died."""
-    return [text for text in caplog.messages if " died; " in text]
+    return [text for text in caplog.messages if " died: " in text]
 
 
 async def until_died(caplog: pytest.LogCaptureFixture, count: int) -> None:
@@ -94,7 +94,7 @@ async def test_a_program_that_does_not_start_is_named_with_the_end_of_its_log(
     tmp_path: Path,
 ) -> None:
     with pytest.raises(
-        LaunchError, match=r"node a ended; its log .*a\.log ends with:\nno device at can0"
+        LaunchError, match=r"node a ended; its log .*a\.log ends with: no device at can0"
     ):
         await Supervisor([program("a", FAULTY), program("b", STEADY)], tmp_path).__aenter__()
     with pytest.raises(LaunchError) as again:
@@ -106,6 +106,22 @@ async def test_a_program_that_does_not_start_is_named_with_the_end_of_its_log(
     says = r"node k was ended by a signal \(Killed\); its log .*k\.log says nothing; start it again"
     with pytest.raises(LaunchError, match=says):
         await Supervisor([killed], tmp_path).__aenter__()
+
+
+async def test_why_a_program_does_not_start_again_stands_in_the_line_that_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Only its log said it: a node whose key became unreadable was started again for ever."""
+    (tmp_path / "first").touch()
+    once = f"import os; os.path.exists({str(tmp_path / 'first')!r}) or exit('k: no key'); "
+    again = program("a", once + STEADY)
+    async with Supervisor([again], tmp_path) as keeper:
+        (tmp_path / "first").unlink()
+        os.kill(keeper.process_ids()["a"], signal.SIGKILL)
+        await until_died(caplog, 2)
+    killed, ended = deaths(caplog)[:2]
+    assert "node a died: it was ended by a signal (Killed); its log " in killed
+    assert "node a died: it ended; its log " in ended and "a.log ends with: k: no key; " in ended
 
 
 async def test_ctrl_c_does_not_reach_the_nodes_before_the_launcher_stops_them(

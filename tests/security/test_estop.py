@@ -27,8 +27,9 @@ from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
 from petrobot.services.comm.canopen.cia402 import DriveState
-from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import Directory, load
 from tests.node.test_processes import Nodes, operator_of, pids
+from tests.ports import free_ports
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat, until
 
@@ -306,6 +307,40 @@ async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> 
     assert (await finished(petrobot("estop", "--clear", *services)))[0] == 3, (
         "nobody there, and nothing to clear"
     )
+
+
+async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_cleared(
+    tmp_path: Path,
+) -> None:
+    """The copy of the caller said for ever that the node was stopped, with a remedy that did
+    nothing."""
+    (port,) = free_ports(1)
+    cell = f"""schema = 1
+[nodes.pc]
+host = "127.0.0.1"
+port = {port}
+[devices.axis]
+node = "pc"
+driver = "petrobot:Driver"
+"""
+    for name in ("here", "there"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "services.toml").write_text(cell)
+    directory = load(tmp_path / "here" / "services.toml")
+    services = ["--services", str(directory.source), "--journal", str(tmp_path)]
+    code, out, _ = await finished(petrobot("estop", *services))
+    assert code == 3 and "latched" in out and still_stopped(directory) == ["pc"]
+    node = petrobot("node", "pc", "--services", str(tmp_path / "there" / "services.toml"))
+    try:
+        assert node.stdout is not None
+        ready = asyncio.to_thread(node.stdout.readline)
+        assert "ready" in await asyncio.wait_for(ready, LIMIT)
+        code, out, err = await finished(petrobot("estop", "--clear", *services))
+        assert code == 0 and "cleared" in out, (out, err)
+        assert still_stopped(directory) == []
+    finally:
+        node.terminate()
+        await finished(node)
 
 
 async def test_estop_says_that_a_stop_cannot_be_cleared(

@@ -63,6 +63,8 @@ class OfferedTask:
         self._why = ""
         """Why the run must be aborted: "cancelled" by the goal's client, or "lost" with the
         link."""
+        self._ending = False
+        """Whether this process must end: it waits for no operator."""
         self._runs = set[asyncio.Task[None]]()
 
     async def serve(self, stop: asyncio.Event) -> None:
@@ -85,7 +87,7 @@ class OfferedTask:
                     self._take(item)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), 0.02)
-        self._why = "lost"
+        self._why, self._ending = "lost", True
         await asyncio.gather(*self._runs)
         self._link.send({"op": "unadvertise_action", **action})
 
@@ -148,6 +150,7 @@ class OfferedTask:
             return state["mission"]["id"] == run and state["mission"]["state"] not in ENDS
 
         told: Message = {}
+        asked = ""
         await page.until(lambda state: state["mission"]["id"] == run, RESULT)
         while is_active(page.state):
             marking, runs = page.state["marking"], page.state["runs"]
@@ -160,7 +163,9 @@ class OfferedTask:
                 told = feedback
                 self._tell("action_feedback", goal, "Feedback", feedback)
             if self._why and page.state["mission"]["state"] != "stopping":
-                await _ordered(page, "abort", {})
+                answer = await _ordered(page, "abort", {})
+                if not answer.get("ok"):
+                    asked = await self._abort_later(page, run, str(answer.get("text")), asked)
             await page.until(lambda state: not is_active(state), LOOK)
             if page.over:
                 raise OperatorError(page.over)
@@ -173,6 +178,18 @@ class OfferedTask:
         status = SUCCEEDED if mission["state"] == "success" else failed
         text = json.dumps(page.state["result"], allow_nan=False)
         return status, mission["state"], str(mission.get("reason") or ""), text
+
+    async def _abort_later(self, page: OperatorClient, run: str, text: str, asked: str) -> str:
+        """Ask the operator who keeps the run from being aborted for the controls, and say so once:
+        `asked` is what was said before; return what is said now. Raises OperatorError if this
+        process ends: then the run is the operator's."""
+        why = f"{run} must be aborted ({self._why}), but {text}"
+        if self._ending:
+            raise OperatorError(f"{why}; it continues")
+        if why != asked:
+            await page.command("ask_controls")
+            print(f"{why}; asked for them", file=sys.stderr, flush=True)
+        return why
 
     def _result(self, goal: str, status: int, state: str, reason: str, result: str = "") -> None:
         values = {"state": state, "reason": reason, "result": result}

@@ -55,7 +55,7 @@ class Fake:
             return []
         op, name = message["op"], message.get("action", "")
         if op == "send_action_goal":
-            if name in ("/rejects", "/absent"):
+            if name in ("/rejects", "/absent", "/rest"):  # /rest: while no client offers it
                 words = (
                     "Action goal was rejected"
                     if name == "/rejects"

@@ -36,6 +36,9 @@ class Page:
         self.commands: list[tuple[str, dict[str, Any]]] = []
         self.gone, self.held, self.obeys = False, False, True
         self.mute, self.late = False, 0.0
+        self.kept = False
+        """Whether an operator has the controls, and gives them to who asks for them."""
+        self.asked = False
 
     async def __aenter__(self) -> Self:
         if self.gone:
@@ -65,6 +68,10 @@ class Page:
         if self.gone:
             raise OperatorError(self.over)
         self.commands.append((verb, data or {}))
+        if verb == "ask_controls":
+            self.asked = True
+        if verb == "take_controls" and self.kept:
+            return {"ok": False, "code": "held", "text": "ana holds the controls; ask for them"}
         if verb == "start" and self.held:
             return {"ok": False, "code": "not_holder", "text": "ana holds the controls"}
         if verb == "start":
@@ -173,6 +180,30 @@ def test_a_cancel_aborts_the_run() -> None:
 
     page, link = played(steps)
     assert link.results() == [("g1", 5, "aborted")] and ("abort", {}) in page.commands
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_an_operator_who_holds_the_controls_is_asked_for_them_by_a_cancel(
+    ends: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody saw that a cancel waited for them, and the process could not be ended meanwhile."""
+
+    async def steps(page: Page, link: Link) -> None:
+        link.say("send_action_goal", "g1", args={})
+        await until(lambda: page.phase == "running", "the run")
+        page.kept = True
+        link.say("cancel_action_goal", "g1")
+        await until(lambda: page.asked, "the request for the controls")
+        if not ends:
+            page.kept = False
+            await until(link.results, "the result")
+
+    page, link = played(steps)
+    assert link.results() == ([("g1", 6, "unknown")] if ends else [("g1", 5, "aborted")])
+    assert page.phase == ("running" if ends else "aborted")
+    assert [verb for verb, _ in page.commands].count("ask_controls") == 1
+    said = "run-2 must be aborted (cancelled), but ana holds the controls; ask for them; asked for"
+    assert capsys.readouterr().err.count(said) == 1
 
 
 def test_a_cancel_that_comes_too_late_leaves_the_success() -> None:
