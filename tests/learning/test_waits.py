@@ -8,16 +8,18 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import count
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.execution.chain import played as mission_figures
+from petrobot.coordinator.analysis.execution.graph import execute
 from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.analysis.time.task_forecast import TIME, forecast
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -42,7 +44,7 @@ from petrobot.coordinator.learning.records import Passage, Waited, WaitEnd
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.table import TrialRow
-from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog, waits_of
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog, waits_of
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
 from petrobot.coordinator.studies.forecast.history import Training, trainings_of
@@ -393,6 +395,64 @@ def test_a_kept_event_serves_the_first_transition_that_can_take_it() -> None:
     drawer = Drawer(RunDistributions(training), training.waits, ones, np.random.default_rng(1))
     found = Play(Structure.of(task), drawer, choices_of(training), np.zeros(8_000, np.int64)).run()
     assert found.time.mean() == pytest.approx(time.mean(), abs=3 * time.std() / sqrt(len(time)))
+
+
+@pytest.mark.parametrize("memory", ["pulse", "latched"])
+def test_an_event_has_a_wait_of_its_own_in_each_place(memory: str) -> None:
+    """A person confirms the first step after 2 s on average and the second one after 10 s. One mean
+    of both was 4.3 s; a time limit of 6 s then decides otherwise."""
+    text = f"""
+schema = 1
+[task]
+name = "asked"
+final = "done == 1 or late == 1"
+goal_transitions = ["second"]
+[errors]
+to = "late"
+[primitive_tasks.work]
+deadline = 9.0
+[events.yes]
+scope = "external"
+{MEMORIES[memory]}
+[places]
+work = {{ kind = "action", tokens = 1 }}
+one = {{}}
+two = {{}}
+done = {{ kind = "control" }}
+late = {{ kind = "control" }}
+[transitions]
+worked = {{ in = ["work:normal"], out = ["one"] }}
+first = {{ in = ["one"], out = ["two"], event = "yes" }}
+first_late = {{ in = ["one"], out = ["late"], after = 6.0 }}
+second = {{ in = ["two"], out = ["done"], event = "yes" }}
+second_late = {{ in = ["two"], out = ["late"], after = 6.0 }}
+"""
+    task, random, trials = loads(text, "asked.toml"), np.random.default_rng(5), list[Trial]()
+    for _ in range(2000):
+        run = RunEntry("work", "work", 0.0, 1.0, "success", taken="worked", seconds=1.0)
+        trials.append(Trial(1, 0.0, 0.0, True, runs=[run], fired={"worked": 1}))
+        for name, mean in (("first", 2.0), ("second", 10.0)):
+            wait = float(random.exponential(mean))
+            end = WaitEnd.FIRED if wait < 6.0 else WaitEnd.CUT
+            trials[-1].waits.append(Waited(name, min(wait, 6.0), end))
+            trials[-1].fired[name if wait < 6.0 else f"{name}_late"] = 1
+            if wait > 6.0:
+                break
+    confirmed = (1 - exp(-6 / 2)) * (1 - exp(-6 / 10))
+    mean = 1 + 2 * (1 - exp(-6 / 2)) + 10 * confirmed
+    measured = measured_from(task, estimates_of(task, rows_of(trials), ""))
+    assert measured.waits["yes"] == pytest.approx(4.3, abs=0.3)
+    exact = mission_figures(execute(task), measured).figures
+    assert exact[TIME][0] == pytest.approx(mean, rel=0.05)
+    view = forecast(stochastic_view(task, measured, timer_stages=64))
+    assert view.firings["second"] == pytest.approx(confirmed, abs=0.02)
+    assert view.done.mean == pytest.approx(mean, rel=0.04)
+    training = Training.of(task, trials)
+    ones = np.ones((1, len(trials)))
+    drawer = Drawer(RunDistributions(training), training.waits, ones, np.random.default_rng(1))
+    found = Play(Structure.of(task), drawer, choices_of(training), np.zeros(8_000, np.int64)).run()
+    assert (found.goals > 0).mean() == pytest.approx(confirmed, abs=0.03)
+    assert found.time.mean() == pytest.approx(mean, rel=0.04)
 
 
 def test_a_pulse_for_two_interrupted_transitions_makes_the_forecast_doubtful() -> None:

@@ -71,6 +71,8 @@ class Measured:
     mixed: frozenset[tuple[str, str]] = frozenset()
     """Keys of `causes` where each cause was given the same share of runs that are not known to have
     been executed, because only their number over all causes was measured."""
+    waits_of: Mapping[str, float] = field(default_factory=dict)
+    """By transition: the mean wait (s) for its event in this place alone."""
 
 
 class OwnEnd(NamedTuple):
@@ -356,9 +358,12 @@ class Numbers:
                 "each did as often"
             )
 
-    def wait(self, event: str) -> float:
-        """Return the mean time (s) until an event comes. Raises NoEstimate."""
-        mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
+    def wait(self, event: str, transition: str = "") -> float:
+        """Return the mean time (s) until an event comes for which this transition waits: a person
+        who presses one button answers sooner in one place than in another. Raises NoEstimate."""
+        mean = self.measured.waits_of.get(
+            transition, self.measured.waits.get(event, self.task.events[event].mean_wait)
+        )
         if mean is None and self._from_ready(event):
             self.assumptions.append(
                 f"{event}: when a run raises it was neither measured nor declared; taken to be "
