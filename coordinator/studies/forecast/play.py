@@ -217,7 +217,7 @@ class _Clocks:
             fresh = np.flatnonzero(served & np.isinf(due))
             moves = [self.moves[i] for i in members]
             for mine in np.unique(waiting[:, fresh], axis=1).T if len(fresh) else ():
-                columns = fresh[(waiting[:, fresh].T == mine).all(axis=1)]
+                columns = fresh[(mine == waiting[:, fresh].T).all(axis=1)]
                 told = [m for m, one in zip(moves, mine, strict=True) if one]
                 if not any(self._drawer.measured(m.name) for m in told):
                     told = moves
