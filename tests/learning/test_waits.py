@@ -19,7 +19,7 @@ from petrobot.coordinator.analysis.execution.chain import played as mission_figu
 from petrobot.coordinator.analysis.execution.graph import execute
 from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import TIME, forecast
+from petrobot.coordinator.analysis.time.task_forecast import GOALS, TIME, forecast
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -453,6 +453,95 @@ second_late = {{ in = ["two"], out = ["late"], after = 6.0 }}
     found = Play(Structure.of(task), drawer, choices_of(training), np.zeros(8_000, np.int64)).run()
     assert (found.goals > 0).mean() == pytest.approx(confirmed, abs=0.03)
     assert found.time.mean() == pytest.approx(mean, rel=0.04)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("together", [True, False])
+def test_one_event_that_preempts_several_runs_ends_them_together(together: bool) -> None:
+    """Two runs of 1 s end at once when the alarm comes: the mean time is MEAN (1 - exp(-1 / MEAN)).
+    As causes of their own they would end independently of each other. One run after the other
+    keeps its own cause."""
+    after = [] if together else ["rest"]
+    text = f"""
+schema = 1
+[task]
+name = "both"
+runs_place = "parts"
+final = "parts == 0 and one == 1 and other == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+[primitive_tasks]
+work = {{ deadline = 9.0 }}
+rest = {{ deadline = 9.0 }}
+[places]
+parts = {{ kind = "control", tokens = 1 }}
+work = {{ kind = "action" }}
+rest = {{ kind = "action" }}
+one = {{ kind = "control" }}
+other = {{ kind = "control" }}
+broken = {{ kind = "control" }}
+[transitions]
+start = {{ in = ["parts"], out = {["work", "rest"] if together else ["work"]} }}
+worked = {{ in = ["work:normal"], out = {["one", *after]} }}
+work_cut = {{ in = ["work:preempt=none"], out = {["one", *after]}, event = "alarm" }}
+rested = {{ in = ["rest:normal"], out = ["other"] }}
+rest_cut = {{ in = ["rest:preempt=none"], out = ["other"], event = "alarm" }}
+"""
+    task = loads(text, "both.toml")
+    found = missions(task, 1500)
+    alone = MEAN * (1 - exp(-1 / MEAN))
+    mean = alone if together else 2 * alone
+    assert np.mean([trial.time for trial in found.trials]) == pytest.approx(mean, rel=0.02)
+    measured = measured_from(task, estimates_of(task, rows_of(found.trials), ""))
+    assert bool(measured.preempted.get(("work", "work"))) is not together
+    exact = mission_figures(execute(task), measured).figures[TIME][0]
+    assert exact == pytest.approx(mean, rel=0.02)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_an_event_that_a_run_awaits_while_it_stays_active_is_measured(memory: str) -> None:
+    """It comes within the second of the run in 1 - exp(-1 / MEAN) of the trials."""
+    text = f"""
+schema = 1
+[task]
+name = "seen"
+runs_place = "parts"
+goal_transitions = ["low"]
+final = "parts == 0 and home == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+{MEMORIES[memory]}
+[primitive_tasks]
+work = {{ deadline = 9.0 }}
+tidy = {{ deadline = 9.0 }}
+[places]
+parts = {{ kind = "control", tokens = 1 }}
+work = {{ kind = "action" }}
+tidy = {{ kind = "action" }}
+watching = {{}}
+home = {{ kind = "control" }}
+broken = {{ kind = "control" }}
+[transitions]
+start = {{ in = ["parts"], out = ["work", "watching"] }}
+low = {{ in = ["watching", "work:going"], out = ["tidy"], event = "alarm" }}
+unseen = {{ in = ["watching", "work:normal"], out = ["home"] }}
+seen = {{ in = ["tidy:normal", "work:normal"], out = ["home"] }}
+"""
+    task = loads(text, "seen.toml")
+    found = missions(task, 1500)
+    share = float(np.mean([trial.goals for trial in found.trials]))
+    assert share == pytest.approx(1 - exp(-1 / MEAN), abs=0.03)
+    measured = measured_from(task, estimates_of(task, rows_of(found.trials), ""))
+    exact = mission_figures(execute(task), measured).figures[GOALS][0]
+    assert exact == pytest.approx(share, abs=0.03)
+    training = Training.of(task, found.trials)
+    told = predict(training, Request(1000, choices_of(training), replicates=20, net=True))
+    assert told["figures"]["R_goal"]["value"] == pytest.approx(share, abs=0.03)
 
 
 def test_a_pulse_for_two_interrupted_transitions_makes_the_forecast_doubtful() -> None:
