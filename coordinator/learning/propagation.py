@@ -158,16 +158,18 @@ def measured_from(
                 sources[key] += f", together at places that end runs after {ends}"
             if not takers:
                 del preempted[key]
+    waits, waits_of = _waits(task, estimates, context)
     return Measured(
         runs,
         _shares(often) if choice is None else choice,
-        _waits(task, estimates, context),
+        waits,
         _switches(task, estimates, context),
         preempted,
         sources,
         causes,
         late=late,
         mixed=frozenset(mixed),
+        waits_of=waits_of,
     )
 
 
@@ -323,10 +325,12 @@ def _shares(often: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, flo
     }
 
 
-def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """Return the mean wait (s) for each event for which transitions wait: the time in which it
-    could have served them, over its occurrences."""
-    waited: dict[str, list[float]] = {}
+def _waits(
+    task: Task, estimates: Estimates, context: str | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the mean wait (s) for each event for which transitions wait, and of each transition
+    that waits for one event: the time in which it could have served them, over its occurrences."""
+    events, transitions = dict[str, list[float]](), dict[str, list[float]]()
     for key, flow in estimates.flows.items():
         if (
             key.task == task.name
@@ -334,11 +338,19 @@ def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, f
             and flow.occurrences
             and key.transition in task.flat.transitions
         ):
-            for event in task.flat.transitions[key.transition].events:
-                total = waited.setdefault(event, [0.0, 0.0])
+            awaited = task.flat.transitions[key.transition].events
+            totals = [events.setdefault(event, [0.0, 0.0]) for event in awaited]
+            # of several events, the wait does not tell when each came
+            if len(awaited) == 1:
+                totals.append(transitions.setdefault(key.transition, [0.0, 0.0]))
+            for total in totals:
                 total[0] += flow.exposure
                 total[1] += flow.occurrences
-    return {event: max(seconds / n, SHORTEST) for event, (seconds, n) in waited.items()}
+    by_event, of_one = (
+        {name: max(seconds / n, SHORTEST) for name, (seconds, n) in waited.items()}
+        for waited in (events, transitions)
+    )
+    return by_event, of_one
 
 
 def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:

@@ -32,16 +32,17 @@ def memory_of(task: Task, t: Transition) -> tuple[EventMemory, EarlyEvent] | Non
 class EventWaits:
     """Measures the waits from the stimuli, firings and states of a mission run.
 
-    Causes of preemption are left out: their event is a way in which the run ends.
+    Causes of preemption are left out: their event is a way in which the run ends. So are internal
+    events of runs that stay active: each comes once in a run, early or late.
     """
 
     def __init__(self, task: Task) -> None:
         flat = task.flat
-        self._net = flat.net
+        self._net, self._events = flat.net, flat.events
         self._watched = {
             t.name: t
             for t in flat.transitions.values()
-            if t.events and not is_cause(flat, t) and all(a.end is not End.GOING for a in t.inputs)
+            if t.events and not is_cause(flat, t) and not self._raised_by_active(t)
         }
         self._memory = {name: memory_of(flat, t) for name, t in self._watched.items()}
         self._since: dict[str, float] = {}
@@ -49,6 +50,10 @@ class EventWaits:
         self._came: dict[str, float] = {}
         """By transition that the present stimulus finds waiting for its event: how long it had."""
         self._seen: dict[str, int] = {}
+
+    def _raised_by_active(self, t: Transition) -> bool:
+        external = all(self._events[name].scope is Scope.EXTERNAL for name in t.events)
+        return not external and any(a.end is End.GOING for a in t.inputs)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Note which transitions an event finds waiting."""
@@ -109,7 +114,7 @@ class EventWaits:
         return memory is EventMemory.LATCHED or all(
             sum(
                 run.phase is not Phase.DONE
-                if a.end is End.PREEMPT
+                if a.end in (End.PREEMPT, End.GOING)
                 else run.phase is Phase.DONE
                 and (run.status is Status.ERROR) == (a.end is End.ERROR)
                 for run in state.tokens.get(a.place, ())

@@ -232,6 +232,20 @@ STUCK: dict[str, Case] = {
             "boxes: only `dropped`, `fallen` can fill it, but `lost` took grasp",
         ),
     ),
+    "a slot is given back twice, and a mark is never taken away": Case(
+        "raw=2 slots~=2 feed! packed",
+        {
+            "load": {"in": "raw slots", "out": "feed"},
+            "fed": {"in": "feed:normal", "out": "packed slots*2"},
+            "failed": {"in": "feed:error", "out": "packed slots"},
+        },
+        "raw == 0 and slots == 2 and packed == 0",
+        (
+            "the end asks for slots == 2 (it holds 4) and packed == 0 (it holds 2)",
+            "slots: taken: 2 by `load`; returned: 4 by `fed`",
+            "packed: filled by `fed`, and no transition takes it",
+        ),
+    ),
     "the last step of a branch that several exits enter loses the arm": Case(
         "jobs=2 arm~=1 reach! home!",
         {

@@ -8,16 +8,18 @@ import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import count
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.execution.chain import played as mission_figures
+from petrobot.coordinator.analysis.execution.graph import execute
 from petrobot.coordinator.analysis.may_run import BUDGET, Cell, may_run
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.analysis.time.task_forecast import GOALS, TIME, forecast
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -42,7 +44,7 @@ from petrobot.coordinator.learning.records import Passage, Waited, WaitEnd
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.table import TrialRow
-from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog, waits_of
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog, waits_of
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
 from petrobot.coordinator.studies.forecast.history import Training, trainings_of
@@ -393,6 +395,153 @@ def test_a_kept_event_serves_the_first_transition_that_can_take_it() -> None:
     drawer = Drawer(RunDistributions(training), training.waits, ones, np.random.default_rng(1))
     found = Play(Structure.of(task), drawer, choices_of(training), np.zeros(8_000, np.int64)).run()
     assert found.time.mean() == pytest.approx(time.mean(), abs=3 * time.std() / sqrt(len(time)))
+
+
+@pytest.mark.parametrize("memory", ["pulse", "latched"])
+def test_an_event_has_a_wait_of_its_own_in_each_place(memory: str) -> None:
+    """A person confirms the first step after 2 s on average and the second one after 10 s. One mean
+    of both was 4.3 s; a time limit of 6 s then decides otherwise."""
+    text = f"""
+schema = 1
+[task]
+name = "asked"
+final = "done == 1 or late == 1"
+goal_transitions = ["second"]
+[errors]
+to = "late"
+[primitive_tasks.work]
+deadline = 9.0
+[events.yes]
+scope = "external"
+{MEMORIES[memory]}
+[places]
+work = {{ kind = "action", tokens = 1 }}
+one = {{}}
+two = {{}}
+done = {{ kind = "control" }}
+late = {{ kind = "control" }}
+[transitions]
+worked = {{ in = ["work:normal"], out = ["one"] }}
+first = {{ in = ["one"], out = ["two"], event = "yes" }}
+first_late = {{ in = ["one"], out = ["late"], after = 6.0 }}
+second = {{ in = ["two"], out = ["done"], event = "yes" }}
+second_late = {{ in = ["two"], out = ["late"], after = 6.0 }}
+"""
+    task, random, trials = loads(text, "asked.toml"), np.random.default_rng(5), list[Trial]()
+    for _ in range(2000):
+        run = RunEntry("work", "work", 0.0, 1.0, "success", taken="worked", seconds=1.0)
+        trials.append(Trial(1, 0.0, 0.0, True, runs=[run], fired={"worked": 1}))
+        for name, mean in (("first", 2.0), ("second", 10.0)):
+            wait = float(random.exponential(mean))
+            end = WaitEnd.FIRED if wait < 6.0 else WaitEnd.CUT
+            trials[-1].waits.append(Waited(name, min(wait, 6.0), end))
+            trials[-1].fired[name if wait < 6.0 else f"{name}_late"] = 1
+            if wait > 6.0:
+                break
+    confirmed = (1 - exp(-6 / 2)) * (1 - exp(-6 / 10))
+    mean = 1 + 2 * (1 - exp(-6 / 2)) + 10 * confirmed
+    measured = measured_from(task, estimates_of(task, rows_of(trials), ""))
+    assert measured.waits["yes"] == pytest.approx(4.3, abs=0.3)
+    exact = mission_figures(execute(task), measured).figures
+    assert exact[TIME][0] == pytest.approx(mean, rel=0.05)
+    view = forecast(stochastic_view(task, measured, timer_stages=64))
+    assert view.firings["second"] == pytest.approx(confirmed, abs=0.02)
+    assert view.done.mean == pytest.approx(mean, rel=0.04)
+    training = Training.of(task, trials)
+    ones = np.ones((1, len(trials)))
+    drawer = Drawer(RunDistributions(training), training.waits, ones, np.random.default_rng(1))
+    found = Play(Structure.of(task), drawer, choices_of(training), np.zeros(8_000, np.int64)).run()
+    assert (found.goals > 0).mean() == pytest.approx(confirmed, abs=0.03)
+    assert found.time.mean() == pytest.approx(mean, rel=0.04)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("together", [True, False])
+def test_one_event_that_preempts_several_runs_ends_them_together(together: bool) -> None:
+    """Two runs of 1 s end at once when the alarm comes: the mean time is MEAN (1 - exp(-1 / MEAN)).
+    As causes of their own they would end independently of each other. One run after the other
+    keeps its own cause."""
+    after = [] if together else ["rest"]
+    text = f"""
+schema = 1
+[task]
+name = "both"
+runs_place = "parts"
+final = "parts == 0 and one == 1 and other == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+[primitive_tasks]
+work = {{ deadline = 9.0 }}
+rest = {{ deadline = 9.0 }}
+[places]
+parts = {{ kind = "control", tokens = 1 }}
+work = {{ kind = "action" }}
+rest = {{ kind = "action" }}
+one = {{ kind = "control" }}
+other = {{ kind = "control" }}
+broken = {{ kind = "control" }}
+[transitions]
+start = {{ in = ["parts"], out = {["work", "rest"] if together else ["work"]} }}
+worked = {{ in = ["work:normal"], out = {["one", *after]} }}
+work_cut = {{ in = ["work:preempt=none"], out = {["one", *after]}, event = "alarm" }}
+rested = {{ in = ["rest:normal"], out = ["other"] }}
+rest_cut = {{ in = ["rest:preempt=none"], out = ["other"], event = "alarm" }}
+"""
+    task = loads(text, "both.toml")
+    found = missions(task, 1500)
+    alone = MEAN * (1 - exp(-1 / MEAN))
+    mean = alone if together else 2 * alone
+    assert np.mean([trial.time for trial in found.trials]) == pytest.approx(mean, rel=0.02)
+    measured = measured_from(task, estimates_of(task, rows_of(found.trials), ""))
+    assert bool(measured.preempted.get(("work", "work"))) is not together
+    exact = mission_figures(execute(task), measured).figures[TIME][0]
+    assert exact == pytest.approx(mean, rel=0.02)
+
+
+@pytest.mark.once
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_an_event_that_a_run_awaits_while_it_stays_active_is_measured(memory: str) -> None:
+    """It comes within the second of the run in 1 - exp(-1 / MEAN) of the trials."""
+    text = f"""
+schema = 1
+[task]
+name = "seen"
+runs_place = "parts"
+goal_transitions = ["low"]
+final = "parts == 0 and home == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+{MEMORIES[memory]}
+[primitive_tasks]
+work = {{ deadline = 9.0 }}
+tidy = {{ deadline = 9.0 }}
+[places]
+parts = {{ kind = "control", tokens = 1 }}
+work = {{ kind = "action" }}
+tidy = {{ kind = "action" }}
+watching = {{}}
+home = {{ kind = "control" }}
+broken = {{ kind = "control" }}
+[transitions]
+start = {{ in = ["parts"], out = ["work", "watching"] }}
+low = {{ in = ["watching", "work:going"], out = ["tidy"], event = "alarm" }}
+unseen = {{ in = ["watching", "work:normal"], out = ["home"] }}
+seen = {{ in = ["tidy:normal", "work:normal"], out = ["home"] }}
+"""
+    task = loads(text, "seen.toml")
+    found = missions(task, 1500)
+    share = float(np.mean([trial.goals for trial in found.trials]))
+    assert share == pytest.approx(1 - exp(-1 / MEAN), abs=0.03)
+    measured = measured_from(task, estimates_of(task, rows_of(found.trials), ""))
+    exact = mission_figures(execute(task), measured).figures[GOALS][0]
+    assert exact == pytest.approx(share, abs=0.03)
+    training = Training.of(task, found.trials)
+    told = predict(training, Request(1000, choices_of(training), replicates=20, net=True))
+    assert told["figures"]["R_goal"]["value"] == pytest.approx(share, abs=0.03)
 
 
 def test_a_pulse_for_two_interrupted_transitions_makes_the_forecast_doubtful() -> None:

@@ -3,6 +3,7 @@ and which path should have returned it."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -287,7 +288,7 @@ def _asked(
 ) -> tuple[str, set[int], set[int], tuple[str, ...]]:
     """Return what of the designed ends does not hold, in words, the places that `final` wants
     to be empty and that are, the places with tokens that it does not want there, and where the
-    tokens went that it asks for."""
+    tokens went that it asks for, or came from that it does not want."""
     task, index = x.engine.compiled.task, x.engine.compiled.net.place_index
     held = {name: draft.marking[p] for name, p in index.items()}
     missed, spent, left, gone = list[str](), set[int](), set[int](), list[str]()
@@ -301,6 +302,8 @@ def _asked(
             missed.append(f"{name} {node.sign} {wanted} (it holds {held[name]})")
             if isinstance(wanted, int) and held[name] < wanted:
                 gone.append(f"{name}: {_fate(task.net, draft, firings, index[name])}")
+            if isinstance(wanted, int) and held[name] > wanted:
+                gone += [f"{name}: {came}" for came in _came(task.net, firings, index[name])]
             if held[name] and Expression("", node).holds({**held, name: 0}):
                 left.add(index[name])
         elif not held[name]:
@@ -530,6 +533,26 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
         else f"to be returned by {back}"
     )
     return f"{taker}, {where}"
+
+
+def _came(net: Net, firings: tuple[str, ...], place: int) -> Iterator[str]:
+    """Yield which firings filled a place, and for one with tokens at the beginning, how many were
+    taken and returned."""
+    took, gave = Counter[str](), Counter[str]()
+    for name in firings:
+        change = dict(net.compiled.changes[net.transition_index[name]]).get(place, 0)
+        (gave if change > 0 else took)[name] += abs(change)
+    if not +gave:
+        return
+    if net.initial[place]:
+        taken, back = (
+            " and ".join(f"{n} by `{name}`" for name, n in (+some).items()) for some in (took, gave)
+        )
+        yield f"taken: {taken or 'none'}; returned: {back}"
+        return
+    taken_out = any(dict(changes).get(place, 0) < 0 for changes in net.compiled.changes)
+    by = " and ".join(f"`{name}`" for name in +gave)
+    yield f"filled by {by}{', and no transition takes it' * (not taken_out)}"
 
 
 def _feeding(net: Net, wanted: Collection[int]) -> set[int]:

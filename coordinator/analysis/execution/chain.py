@@ -526,10 +526,10 @@ class _Builder:
         actions = self._actions(place)
         return bool(actions) and all((place, a) in self.measured.preempted for a in actions)
 
-    def rate(self, event: str) -> float:
-        """Return the rate (1/s) at which an event comes."""
+    def rate(self, event: str, transition: str) -> float:
+        """Return the rate (1/s) at which an event comes for which this transition waits."""
         try:
-            return 1.0 / self.numbers.wait(event)
+            return 1.0 / self.numbers.wait(event, transition)
         except NoEstimate as unknown:
             raise NoEstimate(f"no mean_wait of the event `{event}`") from unknown
 
@@ -585,19 +585,20 @@ class _Builder:
             elif isinstance(stimulus, RunRaised):
                 run = state.run(stimulus.run)
                 assert run is not None
-                waiting = {
+                waiting = [
                     t.name
                     for t in x.engine.compiled.transitions
                     for a in t.actions
                     if a.name == run.place and stimulus.event in a.raised
                     if not self.numbers.waits_ready(t)
                     or self.task.net.has_concession(state.marking, t.index)
-                }
-                drawn = {name for name in waiting if (run.place, name) in self.causes}
-                for name in drawn:
-                    ends[number["run", run.id], f"by.{name}"] = [outcome]
-                if waiting - drawn and outcome.edge >= 0:
-                    events.append((self.rate(stimulus.event), outcome))
+                ]
+                for name in waiting:
+                    if (run.place, name) in self.causes:
+                        ends[number["run", run.id], f"by.{name}"] = [outcome]
+                others = [name for name in waiting if (run.place, name) not in self.causes]
+                if others and outcome.edge >= 0:
+                    events.append((self.rate(stimulus.event, others[0]), outcome))
             elif isinstance(stimulus, VariableChanged):
                 raise NoEstimate(f"no rate at which the variable `{stimulus.name}` changes")
         for (name, status), given in list(own.items()):
@@ -627,16 +628,16 @@ class _Builder:
         """Add an external event: as the cause that its run has drawn for its end, or after a
         wait."""
         compiled = self.x.engine.compiled
-        kept, others = event in compiled.kept, False
+        kept, others = event in compiled.kept, list[str]()
         for t in compiled.waiting[event]:
             name = compiled.transitions[t].name
             drawn = self.slots_of_cause(state, name, number)
             for k in drawn:
                 ends[k, f"by.{name}"] = [outcome]
-            enabled = all(state.marking[p] >= w for p, w in compiled.transitions[t].needs)
-            others |= not drawn and (kept or enabled)
+            enabled = kept or self.task.net.has_concession(state.marking, t)
+            others += [name] if enabled and not drawn else []
         if others and outcome.edge >= 0:
-            events.append((self.rate(event), outcome))
+            events.append((self.rate(event, "" if kept else others[0]), outcome))
 
     def slots_of_cause(
         self, state: State, transition: str, number: dict[tuple[str, str], int]

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from math import sqrt
 from typing import NamedTuple, TypeVar
 
+from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
 from petrobot.coordinator.task import (
     End,
     Estimate,
@@ -24,6 +26,7 @@ from petrobot.coordinator.task import (
     Transition,
 )
 from petrobot.coordinator.task.compiled_task import CompiledTransition
+from petrobot.coordinator.task.net import Net
 
 K = TypeVar("K", bound=Hashable)
 Ending = tuple[str, str]
@@ -71,6 +74,8 @@ class Measured:
     mixed: frozenset[tuple[str, str]] = frozenset()
     """Keys of `causes` where each cause was given the same share of runs that are not known to have
     been executed, because only their number over all causes was measured."""
+    waits_of: Mapping[str, float] = field(default_factory=dict)
+    """By transition: the mean wait (s) for its event in this place alone."""
 
 
 class OwnEnd(NamedTuple):
@@ -158,13 +163,22 @@ def is_cause(task: Task, transition: Transition) -> bool:
     It is one if an event or a timer takes exactly one run, and whatever else it takes is there as
     long as the run: then it has its own distribution of the time since the run began. A transition
     that fires as soon as its arcs allow it (another run has finished, a token has arrived) only
-    cuts the run short: the net determines when. So it does where the event waits for a token.
+    cuts the run short: the net determines when. So it does where the event waits for a token, and
+    where one external event may end runs of several places: their ends then depend on each other.
     """
     runs = [a for a in transition.inputs if a.end is not None]
     waits = bool(transition.events) or transition.after is not None
     if not waits or len(runs) != 1 or runs[0].end is not End.PREEMPT:
         return False
     net, run = task.net, task.net.place_index[runs[0].place]
+    if any(
+        tuple(sorted((run, net.place_index[a.place]))) not in _never_together(net)
+        for u in task.transitions.values()
+        for a in u.inputs
+        if a.end is End.PREEMPT and a.place != runs[0].place
+        if any(task.events[e].scope is Scope.EXTERNAL for e in {*u.events} & {*transition.events})
+    ):
+        return False
     changes = [dict(move) for move in net.compiled.changes]
     return all(
         net.initial[q] >= a.weight * net.initial[run]
@@ -173,6 +187,11 @@ def is_cause(task: Task, transition: Transition) -> bool:
         if a is not runs[0]
         for q in (net.place_index[a.place],)
     )
+
+
+@lru_cache(maxsize=4)
+def _never_together(net: Net) -> set[tuple[int, int]]:
+    return exclusive_places(net, place_semiflows(net))
 
 
 def branching_places(task: Task, transition: Transition) -> set[tuple[str, End | None]]:
@@ -356,9 +375,12 @@ class Numbers:
                 "each did as often"
             )
 
-    def wait(self, event: str) -> float:
-        """Return the mean time (s) until an event comes. Raises NoEstimate."""
-        mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
+    def wait(self, event: str, transition: str = "") -> float:
+        """Return the mean time (s) until an event comes for which this transition waits: a person
+        who presses one button answers sooner in one place than in another. Raises NoEstimate."""
+        mean = self.measured.waits_of.get(
+            transition, self.measured.waits.get(event, self.task.events[event].mean_wait)
+        )
         if mean is None and self._from_ready(event):
             self.assumptions.append(
                 f"{event}: when a run raises it was neither measured nor declared; taken to be "

@@ -236,18 +236,20 @@ class _Play:
     def _observe(self, until: Values) -> None:
         span = np.maximum(0.0, until - np.maximum(self.now[self.alive], self.warmup))
         span = np.where(np.isfinite(span), span, 0.0)
-        if span.any():
-            self.area[:, self.alive] += self.state.tokens * span
-            self.observed[self.alive] += span
+        stays = np.flatnonzero(span)  # most steps take no time
+        self.area[:, self.alive[stays]] += self.state.tokens[:, stays] * span[stays]
+        self.observed[self.alive[stays]] += span[stays]
 
     def _arrived(self, tangible: Mask) -> Mask:
         """Return which replicas have ended, and note when they reached the goal."""
         ended = np.zeros(len(self.alive), dtype=np.bool_)
+        rests = np.flatnonzero(tangible)
+        tokens = self.state.tokens[:, rests]
         if self.goal is not None:
-            ended |= tangible & self.goal(self.state.tokens)
+            ended[rests] = self.goal(tokens)
             self.reached[self.alive[ended]] = self.now[self.alive[ended]]
         if self.lost is not None:
-            ended |= tangible & self.lost(self.state.tokens)
+            ended[rests] |= self.lost(tokens)
         return ended
 
     def _keep(self, which: Mask) -> None:

@@ -200,12 +200,13 @@ def _none_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[Needs]:
     yield from cases
 
 
-def _some_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[Needs]:
-    """Yield cases, of which no two hold together, in which some of the transitions is enabled."""
+def _some_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[tuple[Needs, str]]:
+    """Yield cases, of which no two hold together, in which some of the transitions is enabled, and
+    the first that is."""
     for i, x in enumerate(waiting):
         for case in _none_enabled(waiting[:i]):
             if (found := _both(case, (dict(x.needs), dict(x.bars)))) is not None:
-                yield found
+                yield found, x.name
 
 
 @dataclass(frozen=True)
@@ -653,7 +654,12 @@ class _Derivation:
         has raised is forgotten."""
         active = [p for p in self.phases[name] if p not in self.waiting]
         for event in self.raised[name]:
-            flag, mean = f"{name}.raised {event}", self.numbers.wait(event)
+            asks = (
+                x.name
+                for x in self.compiled.values()
+                if any(a.name == name and event in a.raised for a in x.actions)
+            )
+            flag, mean = f"{name}.raised {event}", self.numbers.wait(event, next(asks, ""))
             source = self._wait_source(event)
             for phase in active:
                 label = f"{name}.raises {event} in {phase}"
@@ -876,11 +882,11 @@ class _Derivation:
         )
         if not waiting or not (before or self._together(waiting)):
             return
-        flag, rate = f"event {event.name}", 1.0 / self.numbers.wait(event.name)
+        flag, source = f"event {event.name}", self._wait_source(event.name)
         self.parts.places[flag] = 0
-        source = self._wait_source(event.name)
-        cases: list[Needs] = [({}, {})] if kept else list(_some_enabled(waiting))
-        for i, case in enumerate(cases):
+        cases = [(({}, {}), "")] if kept else list(_some_enabled(waiting))
+        for i, (case, first) in enumerate(cases):
+            rate = 1.0 / self.numbers.wait(event.name, first)
             name = f"{flag} comes" if len(cases) == 1 else f"{flag} comes {i + 1}"
             need, self.parts.inhibit[name] = self._named(case)
             self.parts.inhibit[name][flag] = 1
@@ -1166,7 +1172,7 @@ class _Derivation:
                 name, need | {self.called[t.name]: 1}, give, share, self.served[t.name]
             )
         elif event := self._awaited_event(t):
-            rate = share / self.numbers.wait(event)
+            rate = share / self.numbers.wait(event, t.name)
             self.parts.timed(name, need, give, rate, self._wait_source(event), 1)
         else:
             declared = t.weight is not None and not measured  # how often it fired contains it

@@ -605,18 +605,22 @@ class Drawer:
             return None
         transition, (seconds, trials, came) = transitions[0], known[0]
         if came is not None:
-            mean = self._mean_waits(transition, known)[replicate]
+            mean = self._mean_waits(tuple(transitions), known)[replicate]
             return -mean * np.log1p(-self.chance(len(replicate)))
         index = self._draw(transition, np.full(len(seconds), 1.0 / len(seconds)), trials, replicate)
         drawn: Values = seconds[index]
         return drawn
+
+    def measured(self, transition: str) -> bool:
+        """Return whether waits of the transition were measured."""
+        return transition in self._waits
 
     def as_measured(self, transition: str) -> bool:
         """Return whether waits of the transition are drawn as they were measured: since it could
         fire, not since its event could come."""
         return transition in self._waits and self._waits[transition].came is None
 
-    def _mean_waits(self, key: str, known: Sequence[Waits]) -> Values:
+    def _mean_waits(self, key: tuple[str, ...], known: Sequence[Waits]) -> Values:
         """Return the exposure over the occurrences by replicate; over all trials if the event never
         came in those of the replicate."""
         if key not in self._bounds:

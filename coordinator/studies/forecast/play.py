@@ -161,7 +161,7 @@ class _Variables:
 class _Clocks:
     """When the events and timers come for which transitions wait. Transitions that wait for the
     same latched event, of which the rate is known, share a clock: the first of them that can fire
-    consumes it."""
+    consumes it. The rate is that of the transitions which the event would serve if it came now."""
 
     def __init__(
         self,
@@ -188,6 +188,8 @@ class _Clocks:
         }
         """By transition: the clock of its latched event."""
         self.due = np.full((len(self.members), n), np.inf)
+        self._waiting = np.zeros((len(self.moves), n), np.bool_)
+        """Which of the transitions the event would serve."""
         self._pulses = {event: drawer.chance(n) * s for event, s in periods.items()}
         """By event of a timer: when it comes for the first time. A trial may begin at any time."""
 
@@ -197,7 +199,7 @@ class _Clocks:
 
     def keep(self, kept: Mask) -> None:
         """Continue with some columns."""
-        self.due = self.due[:, kept]
+        self.due, self._waiting = self.due[:, kept], self._waiting[:, kept]
         self._pulses = {event: first[kept] for event, first in self._pulses.items()}
 
     def wait(self, able: Sequence[Mask], now: Values, tokens: Codes, replicate: Codes) -> Values:
@@ -206,11 +208,20 @@ class _Clocks:
         fire, if nothing happens before."""
         fires = np.full((len(self.moves), len(now)), np.inf)
         for due, members in zip(self.due, self.members, strict=True):
-            served = np.any([self._served(self.moves[i], able[i], tokens) for i in members], axis=0)
+            waiting = np.array([self._served(self.moves[i], able[i], tokens) for i in members])
+            served = waiting.any(axis=0)
+            if len(members) > 1:  # at a rate, so what is left of a wait is like a wait
+                others = (waiting != self._waiting[members]).any(axis=0)
+                due[others & (due > now)] = np.inf
+                self._waiting[members] = waiting
             fresh = np.flatnonzero(served & np.isinf(due))
-            if len(fresh):
-                moves = [self.moves[i] for i in members]
-                due[fresh] = now[fresh] + self._drawn(moves, fresh, now, replicate)
+            moves = [self.moves[i] for i in members]
+            for mine in np.unique(waiting[:, fresh], axis=1).T if len(fresh) else ():
+                columns = fresh[(mine == waiting[:, fresh].T).all(axis=1)]
+                told = [m for m, one in zip(moves, mine, strict=True) if one]
+                if not any(self._drawer.measured(m.name) for m in told):
+                    told = moves
+                due[columns] = now[columns] + self._drawn(told, columns, now, replicate)
             due[~served] = np.inf
             free = np.ones(len(now), np.bool_)  # the event serves one of them
             for i in sorted(members, key=lambda i: -self.moves[i].priority):

@@ -85,7 +85,7 @@ def register(
                     changes=request.changes,
                 )
                 if unlike := unlike_trials(regimes[name], regimes[name]["gspn"]):
-                    regimes[name]["gspn"]["doubts"] = unlike
+                    regimes[name]["gspn"] = {"why": unlike}
                 doubts = contradictions(regimes[name], regimes[name]["gspn"])
                 if doubts and not _views_miss(trainings[name], estimates, name, cell):
                     regimes[name]["doubts"] += doubts
@@ -226,17 +226,20 @@ def contradictions(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str
     ]
 
 
-def unlike_trials(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str]:
+def unlike_trials(said: Mapping[str, Any], view: Mapping[str, Any]) -> str:
     """Return in words which figures of the stochastic view the trials contradict, from which the
-    figures of the forecast come."""
-    if said["from"] != TRIALS:
-        return []
-    return [
-        f"{name} is {value:.4g} by the trials, but {other:.4g} by the stochastic view: one of its "
-        "assumptions does not hold here, so do not rely on it in `analyse`, `simulate` or a "
-        "what-if; the figures above are those of the trials"
-        for name, value, other in _apart(said, view)
-    ]
+    figures of the forecast come; empty if none. Such a view is no part of the forecast."""
+    apart = _apart(said, view) if said["from"] == TRIALS else []
+    if not apart:
+        return ""
+    figures = "; ".join(
+        f"{name} is {value:.4g} by the trials, but {other:.4g} by this view"
+        for name, value, other in apart
+    )
+    return (
+        f"left out: {figures}. One of its assumptions does not hold here, so do not rely on it in "
+        "`analyse`, `simulate` or a what-if"
+    )
 
 
 def _apart(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[tuple[str, float, float]]:

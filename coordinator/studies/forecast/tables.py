@@ -91,8 +91,7 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
             f"      its P_complete: 95 % {_bounds(gspn['P_complete_interval'])} from the measured "
             f"shares; relative error of the solution {gspn['P_complete_error']:.0e}"
         )
-    lines += [f"      {note}" for note in gspn.get("notes", ())]
-    return [*lines, *(f"      DOUBTFUL: {doubt}" for doubt in gspn.get("doubts", ()))]
+    return [*lines, *(f"      {note}" for note in gspn.get("notes", ()))]
 
 
 def _worst(said: Mapping[str, Any]) -> str:
