@@ -655,8 +655,8 @@ def held(net: Net, marking: Marking, parts: list[tuple[str, ...]]) -> tuple[int,
     return tuple(sum(marking[net.place_index[p]] for p in part) for part in parts)
 
 
-def view_is_within_the_ends_net(task: Task) -> bool:
-    """Compare the markings of both; return False if one of them is too large or not known."""
+def view_is_within_the_ends_net(task: Task, states: int) -> bool:
+    """Compare the markings of both; return False if one of them has more states or is not known."""
     task = timed(task)
     try:
         view = stochastic_view(task, stages=1, timer_stages=1)
@@ -664,9 +664,10 @@ def view_is_within_the_ends_net(task: Task) -> bool:
         assert "one server" in str(fault)
         return False
     n = ends_net(task)
-    limits = SearchLimits(states=20_000)
-    ours, theirs = explore(view.gspn.net, limits=limits), explore(n.net, limits=limits)
-    if not ours.complete or not theirs.complete or n.left_out:
+    limits = SearchLimits(states=states)
+    if n.left_out or not (ours := explore(view.gspn.net, limits=limits)).complete:
+        return False
+    if not (theirs := explore(n.net, limits=limits)).complete:
         return False
     parts, their_parts = parts_of_the_view(task, view), parts_of_the_ends_net(n)
     allowed = {held(n.net, theirs.marking(i), their_parts) for i in range(len(theirs))}
@@ -685,11 +686,12 @@ def view_is_within_the_ends_net(task: Task) -> bool:
 @settings(COMMON, max_examples=60)
 @given(any_tasks())
 def test_the_stochastic_view_stays_within_the_ends_net(task: Task) -> None:
-    assume(view_is_within_the_ends_net(task))
+    # A task with more states is drawn again: to explore one of those in full may take seconds.
+    assume(view_is_within_the_ends_net(task, states=2_000))
 
 
 @pytest.mark.proof
 @settings(COMMON, max_examples=1000)
 @given(any_tasks())
 def test_the_stochastic_view_stays_within_the_ends_net_at_length(task: Task) -> None:
-    assume(view_is_within_the_ends_net(task))
+    assume(view_is_within_the_ends_net(task, states=20_000))

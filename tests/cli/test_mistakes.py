@@ -4,9 +4,11 @@ what was expected, what was found, what to do."""
 from __future__ import annotations
 
 import argparse
+import copy
 import io
 import re
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -15,11 +17,13 @@ import pytest
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator.session import RunSession
 from petrobot.coordinator.studies.campaign.plan import MANIFEST
+from petrobot.services.comm.location_file import code as cell_code
 
 CHECK = ["check", "arm_bot.toml"]
 TASK, CELL, CODE = "arm_bot.toml", "services.toml", "arm_bot.py"
 RUN = ["run", "arm_bot.toml", "--mode", "lockstep", "--quiet", "--no-page"]
 
+Reader = Callable[[str, float], tuple[list[cell_code.Facts], str]]
 Mistake = tuple[str, str, str, str]
 """File, original text, text with the mistake, and the message as a regular expression. LINE means
 the line of the mistake, or any line if the message is about another file."""
@@ -978,6 +982,25 @@ def _one_robot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Modules are looked up beside the location file; remove those of earlier tests."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delitem(sys.modules, "arm_bot", raising=False)
+    monkeypatch.setattr(cell_code, "_ask_process", _read_once)
+
+
+_read: dict[object, tuple[list[cell_code.Facts], str]] = {}
+
+
+def _read_once(
+    question: str, seconds: float, read: Reader = cell_code._ask_process
+) -> tuple[list[cell_code.Facts], str]:
+    """Read the same code for the same question only once: most mistakes are in other files, and to
+    read it takes a process. The files of each test are in a folder of its own."""
+    here = str(Path.cwd())
+    texts = tuple((p.name, p.read_bytes()) for p in sorted(Path().glob("*.py")))
+    key = (question.replace(here, "."), seconds, texts)
+    if (known := _read.get(key)) is None:
+        known = read(question, seconds)
+        if here not in repr(known):
+            _read[key] = known
+    return copy.deepcopy(known)
 
 
 @pytest.fixture(scope="session")
