@@ -39,6 +39,7 @@ from petrobot.services.device import (
     Driver,
     HasPicture,
     Key,
+    Ports,
     QuickStopping,
     Remote,
     faults_of_keys,
@@ -64,6 +65,8 @@ MADE = {
     actions.error: 'error("cause", "text")',
 }
 """What makes a result, and how it is written."""
+NO_RESULT = (ast.Constant, ast.JoinedStr, ast.Dict, ast.List, ast.Set, ast.Tuple, ast.Compare)
+"""What an action may return by mistake, in place of a result."""
 API = (actions.__name__, Driver.__module__)
 """Modules of petrobot that define the interface of actions and drivers."""
 METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
@@ -100,6 +103,9 @@ class _Seen:
     """All texts in the code: a cause that is not a literal may be one of them."""
     streams: dict[str, tuple[str, int]] = field(default_factory=dict)
     events: dict[str, tuple[str, int]] = field(default_factory=dict)
+    of_device: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """External events, which a driver raises through its ports: not those of an action, although
+    its `Context[...]` names the driver."""
     any_event: bool = False
     """Whether it raises events whose names are not literals."""
     calls: dict[str, tuple[str, int]] = field(default_factory=dict)
@@ -139,7 +145,7 @@ class _Seen:
         for name, kinds in other.values.items():
             own = self.values.setdefault(name, {})
             own |= kinds | own
-        for one in ("streams", "events", "calls", "gets", "reads", "uses"):
+        for one in ("streams", "events", "of_device", "calls", "gets", "reads", "uses"):
             places: dict[str, tuple[str, int]] = getattr(self, one)
             places |= getattr(other, one) | places
 
@@ -175,14 +181,15 @@ class _Code:
     def awaited(self) -> set[ast.AST]:
         """Calls that are awaited, or passed on to code that may await them: not operands, and not
         what a result or the context receives as a value."""
-        waits = {n.id for a in self.nodes if isinstance(a, ast.Await) for n in ast.walk(a.value)
-                 if isinstance(n, ast.Name)}  # fmt: skip
         found, values = set[ast.AST](), set[ast.AST]()
         for node in self.nodes:
             if isinstance(node, ast.BinOp | ast.Compare | ast.UnaryOp):
                 values |= {*ast.iter_child_nodes(node)}
             elif isinstance(node, ast.Call) and self._takes_values(node):
                 values |= {*node.args, *(k.value for k in node.keywords)}
+        waits = {n.id for a in self.nodes if isinstance(a, ast.Await) for n in ast.walk(a.value)
+                 if isinstance(n, ast.Name) and n not in values}  # fmt: skip
+        for node in self.nodes:
             if isinstance(node, ast.Await | ast.Return | ast.Yield):
                 found |= set(ast.walk(node))
             elif isinstance(node, ast.Lambda):
@@ -228,6 +235,22 @@ class _Code:
             n.id for n in self.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
         }
         return stored | {n.arg for n in self.nodes if isinstance(n, ast.arg)}
+
+    @cached_property
+    def typed(self) -> dict[str, str]:
+        """Types of a function's parameters, as far as it declares them and binds them once."""
+        if not isinstance(self.tree, ast.FunctionDef | ast.AsyncFunctionDef):
+            return {}
+        stored = {n.id for n in self.nodes if isinstance(n, ast.Name) and
+                  isinstance(n.ctx, ast.Store)}  # fmt: skip
+        given = self.tree.args
+        return {
+            one.arg: ast.unparse(one.annotation)
+            for one in (*given.args, *given.kwonlyargs)
+            if one.annotation is not None
+            and one.arg not in stored
+            and ast.unparse(one.annotation) in _KINDS.values()
+        }
 
     @cached_property
     def branched(self) -> set[ast.AST]:
@@ -430,14 +453,18 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
                 seen.device or node in code.branched or code.asks_for_device
             ):
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
-        if in_action and isinstance(node, ast.Attribute):
-            _misspelt(code, node, seen)
+        if isinstance(node, ast.Attribute):
+            _misspelt(code, node, seen, in_action)
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in DEVICE:
             guarded = node.value in code.branched or node in code.tried or code.asks_for_device
             if isinstance(node.ctx, ast.Load) and not guarded:
                 seen.uses.setdefault(node.attr, (code.file, node.lineno))
         if isinstance(node, ast.While) and in_action:
             _loops(code, node, seen)
+        raised = node.exc if isinstance(node, ast.Raise) else None
+        if isinstance(raised, ast.Call) and any(code.value(raised.func) is one for one in MADE):
+            text = f"`raise {ast.unparse(raised)}`: a result is returned; write `return`"
+            seen.faults.append((code.file, raised.lineno, text))
         if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
             name = str(node.slice.value)
             state = ast.unparse(node.value) in {f"{one}.state" for one in DEVICE} | states
@@ -527,11 +554,13 @@ def _loops(code: _Code, loop: ast.While, seen: _Seen) -> None:
         seen.faults.append((code.file, loop.lineno, f"{text} by `await ctx.sleep(...)`"))
 
 
-def _misspelt(code: _Code, node: ast.Attribute, seen: _Seen) -> None:
-    """Record a name that the context lacks, if it is close to one that it has: something else may
-    be called `context`, too."""
-    owner, known = ast.unparse(node.value), dir(actions.Context)
-    if owner not in CONTEXT or node.attr in known:
+def _misspelt(code: _Code, node: ast.Attribute, seen: _Seen, in_action: bool) -> None:
+    """Record a name that the context or a driver's ports lack, if it is close to one that they
+    have: something else may be called `context`, too."""
+    owner = ast.unparse(node.value)
+    kind = Ports if owner == "self.ports" else actions.Context
+    known = dir(kind)
+    if node.attr in known or (kind is actions.Context and not (in_action and owner in CONTEXT)):
         return
     if close := difflib.get_close_matches(node.attr, known, n=1):
         text = f"`{owner}` has no `{node.attr}`; did you mean `{owner}.{close[0]}`?"
@@ -593,6 +622,8 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
             seen.complete = False
         if name in AWAITED and not ports and node not in code.awaited:
             _unawaited(code, node, seen)
+        if not ports:
+            _binds(code, node, name, seen)
         if name in REMEMBERS and not ports:
             seen.memory = seen.memory or (code.file, node.lineno)
             _remembers(code, node, name, first, seen)
@@ -605,9 +636,26 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
                 _set_points(code, node, seen)
                 seen.streams.setdefault(first, (code.file, node.lineno))
             elif name == "raise_event":
-                seen.events.setdefault(first, (code.file, node.lineno))
+                events = seen.of_device if ports else seen.events
+                events.setdefault(first, (code.file, node.lineno))
             elif name == "call" and not ports:
                 seen.calls.setdefault(first, (code.file, node.lineno))
+
+
+def _binds(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:
+    """Record a call of a method of the context with wrong arguments."""
+    method = vars(actions.Context).get(name)
+    starred = any(isinstance(one, ast.Starred) for one in node.args)
+    if not inspect.isfunction(method) or starred or any(k.arg is None for k in node.keywords):
+        return
+    try:
+        inspect.signature(method).bind(
+            None, *node.args, **{str(k.arg): None for k in node.keywords}
+        )
+    except TypeError as fault:
+        takes = str(inspect.signature(method)).partition(" ->")[0].replace("(self, ", "(")
+        text = f"`{ast.unparse(node)}`: {fault}; it is `{ast.unparse(node.func)}{takes}`"
+        seen.faults.append((code.file, node.lineno, text))
 
 
 def _set_points(code: _Code, node: ast.Call, seen: _Seen) -> None:
@@ -687,6 +735,8 @@ def _result(code: _Code, node: ast.Call, made: Callable[..., Any], seen: _Seen) 
 def _kind(code: _Code, node: ast.expr) -> str:
     """Return the type of an expression's value; empty if its form does not show it."""
     match node:
+        case ast.Name(id=name):
+            return code.typed.get(name, "")
         case ast.Constant():
             return _KINDS.get(type(node.value), "")
         case ast.JoinedStr():
@@ -722,7 +772,10 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         hints = get_type_hints(thing)
     except Exception:
         hints = {}
-    named = [p for p in parameters[1:] if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    first = parameters[0] if parameters else None
+    alone = first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS
+    own_names = parameters if alone else parameters[1:]
+    named = [p for p in own_names if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
     seen = _Seen()
     is_async = inspect.iscoroutinefunction(thing)
     if inspect.isfunction(inspect.unwrap(thing)):
@@ -734,8 +787,7 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     own = _code(thing) if inspect.isfunction(thing) else None
     if own is not None:
         _ends(own, thing.__name__, seen)
-    first = parameters[0] if parameters else None
-    if first is None or first.kind is first.KEYWORD_ONLY or hints.get(first.name) in _KINDS:
+    if alone:
         source = inspect.unwrap(thing).__code__
         text = f"{thing.__name__} takes no context; its first parameter is `ctx`"
         text += f", found {first.name!r}" if first else ""
@@ -757,7 +809,7 @@ def _ends(own: _Code, name: str, seen: _Seen) -> None:
         text = f"{name} returns no result here; end it with `return success()`"
         seen.faults.append((own.file, last.end_lineno, text))
     for value in _returned(own.tree):
-        if isinstance(value, ast.Constant) or any(own.value(value) is one for one in MADE):
+        if isinstance(value, NO_RESULT) or any(own.value(value) is one for one in MADE):
             text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
             seen.faults.append((own.file, value.lineno, text))
 
@@ -819,6 +871,7 @@ def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, An
         "state": _state(thing),
         "members": _members(thing),
         **_plain(seen),
+        "events": seen.of_device | seen.events,
     }
 
 
@@ -864,10 +917,15 @@ def _members(thing: type) -> list[str] | None:
     is cyclic; None if the source does not show them."""
     if getattr(thing, "period", None) is not None:
         return [name for name in vars(Remote) if not name.startswith("_")]
+    return None if _sets_period(thing) else _own_names(thing)
+
+
+def _own_names(thing: type) -> list[str] | None:
+    """Return the attributes of a driver; None if the source does not show them."""
     codes = [_code(base) for base in thing.__mro__ if base not in (object, Driver)]
     nodes = [node for code in codes if code is not None for node in code.nodes]
     words = {node.id for node in nodes if isinstance(node, ast.Name)}
-    if None in codes or _sets_period(thing) or hasattr(thing, "__getattr__") or "setattr" in words:
+    if None in codes or hasattr(thing, "__getattr__") or words & {"setattr", "vars"}:
         return None
     stored = {
         n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)
@@ -882,6 +940,7 @@ def _methods(thing: type[Driver], seen: _Seen) -> None:
         for name, method in vars(base).items():
             used = inspect.isfunction(method) and getattr(thing, name) is method
             if used and (code := _code(method)) is not None:
+                _unset_names(thing, code, seen)
                 line = code.tree.lineno  # type: ignore[attr-defined]
                 what = f"`{name}` of {base.__name__}"
                 if text := _fault_of_method(name, method, code):
@@ -889,6 +948,18 @@ def _methods(thing: type[Driver], seen: _Seen) -> None:
                 elif near := _meant(thing, name):
                     text = f"{what} is never called; did you mean `{near}`?"
                     seen.doubtful.append((code.file, line, text))
+
+
+def _unset_names(thing: type[Driver], code: _Code, seen: _Seen) -> None:
+    """Record what a method reads of its driver and nothing sets, if it is close to a name that is
+    there."""
+    known = _own_names(thing)
+    for node in code.nodes if known is not None else ():
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "self":
+            close = difflib.get_close_matches(node.attr, known or (), n=1)
+            if node.attr not in (known or ()) and close and node not in code.tried:
+                text = f"`self.{node.attr}` is set nowhere; did you mean `self.{close[0]}`?"
+                seen.doubtful.append((code.file, node.lineno, text))
 
 
 def _fault_of_method(name: str, method: Callable[..., Any], code: _Code) -> str:

@@ -259,10 +259,15 @@ class Driver:
         for name, value in read_keys(type(self), config).items():
             setattr(self, name, value)
         self.limit(config)
+        self._verify()
         self.setup()
 
     def setup(self) -> None:
         """Prepare the driver: its keys are read, and `ports` can be used."""
+
+    def _verify(self) -> None:
+        """Raise ValueError, "KEY: what is wrong", if the values of its keys make no sense. A check
+        calls it for an object that has nothing but these."""
 
     def limit(self, config: Mapping[str, Any]) -> None:
         """Read `speed`, `workspace` and `dry_run` of the device's table: for a constructor that
@@ -348,6 +353,14 @@ def faults_of_keys(
     `faults_of_limits`."""
     reads_itself = driver.__init__ is not Driver.__init__ and not keys_of(driver)  # type: ignore[misc]
     own = [] if reads_itself else _faults_of_keys(driver, config)
+    if not own and issubclass(driver, Driver) and not reads_itself:
+        probe = object.__new__(driver)
+        vars(probe).update(read_keys(driver, config))
+        try:
+            probe._verify()
+        except ValueError as fault:
+            name, _, text = str(fault).partition(": ")
+            own.append((name, text))
     return own + faults_of_limits(driver, config, moves)
 
 

@@ -41,8 +41,10 @@ class Axis(Driver):
     _share = 1.0
 
     def __init__(self, config: Mapping[str, Any], ports: Ports | None) -> None:
-        """Raises ValueError also for limits and stations that make no sense."""
         super().__init__(config, ports)
+        self._verify()  # `setup` may have set `at`
+
+    def _verify(self) -> None:
         for name, at in self.stations.items():
             numbers([at], 1, f"stations.{name}")
         if not self.ends and not self.stations:
@@ -52,9 +54,9 @@ class Axis(Driver):
             raise ValueError(f"ends: expected [least, greatest] position, found {self.ends}")
         if beyond := [name for name, at in self.stations.items() if not low <= at <= high]:
             raise ValueError(f"stations: {', '.join(beyond)} lies beyond the ends {self.ends} m")
-        if not (self.top_speed > 0.0 and self.acceleration > 0.0):
-            limits = f"{self.top_speed:g} and {self.acceleration:g}"
-            raise ValueError(f"top_speed, acceleration: expected numbers above 0, found {limits}")
+        for name in ("top_speed", "acceleration"):
+            if not (value := getattr(self, name)) > 0.0:
+                raise ValueError(f"{name}: expected a number above 0, found {value:g}")
         if self.along not in ("x", "y", "z"):
             raise ValueError(f"along: expected x, y or z in the driver, found {self.along!r}")
         self.at = min(high, max(low, self.at))

@@ -31,6 +31,8 @@ MISSPELLED = re.compile("unknown (key|table)")
 """Beginning of the faults that name an unknown key."""
 GROUPS = ("places", "transitions", "parameters")
 """Tables of a subnet."""
+ALONE = ("schema", "errors", "keys", "links", "coordinator", "parameters")
+"""Tables and keys at the top that contain no elements by name."""
 
 
 @dataclass
@@ -147,7 +149,9 @@ class FaultyFile(Generic[T]):
             self.unknown.add(_element(path))
             if said.startswith("unknown "):
                 self.unknown |= {*_quoted(_found(said))}
-            self._leave_out(data, path, _quoted(said), again=again)
+            # A wrong type is that of the whole list.
+            words = [] if re.match(r".* is not (a|true) ", said) else _quoted(said)
+            self._leave_out(data, path, words, again=again)
 
     def _as_proposed(self, table: dict[str, Any], key: str, said: str) -> bool:
         """Mend what the message of a fault says how to mend; return whether it does."""
@@ -173,13 +177,15 @@ class FaultyFile(Generic[T]):
         self, data: dict[str, Any], path: list[str], words: list[str], *, again: bool
     ) -> None:
         """Leave out the items of a list that have one of the words, else the whole value; if that
-        was done before, or it is missing, the table around it."""
+        was done before, or it is missing, the table around it, up to its element: what the other
+        elements say is not in doubt."""
         holders: list[Any] = [data]
         for part in path:
             holders.append(holders[-1].get(part) if isinstance(holders[-1], dict) else None)
-        while path and (again or holders[len(path)] is None):
+        least = min(len(path), _depth(path))
+        while len(path) > least and (again or holders[len(path)] is None):
             path, again = path[:-1], False
-        if not path:
+        if holders[len(path)] is None:
             return
         value, table = holders[len(path)], holders[len(path) - 1]
         known = {*_keys_of(data)}
@@ -267,10 +273,20 @@ def _keys_of(value: Any) -> Iterator[str]:
             yield from _keys_of(inner)
 
 
+def _depth(path: list[str]) -> int:
+    """Return how many parts of a key name its element."""
+    if path[0] in ALONE:
+        return 1
+    return 4 if path[0] == "subnets" and path[2:3] in ([one] for one in GROUPS) else 2
+
+
 def _element(path: list[str]) -> str:
-    """Return the name of the element that a key belongs to."""
-    if path[0] in ("task", "errors"):
-        return path[0 if path[0] == "errors" else -1]
+    """Return the name of the element that a key belongs to; of `[errors]`, which actions without a
+    branch of their own need, the word of their arcs."""
+    if path[-2:] == ["errors", "to"]:
+        return "error"
+    if path[0] == "task":
+        return path[-1]
     return path[3] if path[0] == "subnets" and len(path) > 3 else path[min(1, len(path) - 1)]
 
 

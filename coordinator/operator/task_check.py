@@ -203,7 +203,7 @@ def _with_code(
     by_action = {
         action.name: {**code[action.run], "device": code.get(_driver(directory, action.device), {})}
         for action in actions
-        if action.run in code
+        if action.run in code and "classes" not in code[action.run]  # a class is no action
     }
     args = {action.name: action.args for action in actions}
     drivers = {device.name: code.get(device.driver, {}) for device in directory.devices.values()}
@@ -246,7 +246,9 @@ def _services(directory: Directory, code: Mapping[str, Facts]) -> dict[str, Fact
 
     none: Mapping[str, Any] = {"any_put": False, "puts": ()}
     found = {n: code.get(s.run, {}) if s.run else none for n, s in directory.services.items()}
-    return found | (dict.fromkeys(MEMORY_CALLS, none) if MEMORY in found else {})
+    if found.pop(MEMORY, None) is None:
+        return found
+    return found | dict.fromkeys(MEMORY_CALLS, none)  # its calls have names of their own
 
 
 def _raised(task: Task, directory: Directory, code: Mapping[str, Facts]) -> tuple[set[str], bool]:

@@ -41,6 +41,8 @@ from petrobot.coordinator.task.wording import Fault, few, listed, nearest
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
+MOST_TRIES = 100
+"""Most tries of one place: more are a loop that the task should say."""
 MOST_COPIES = 1_000
 """Largest number of copies that `tries` may make of one transition (`expansion`)."""
 LONGEST = 1e9
@@ -198,6 +200,9 @@ def _event(task: Task, e: Event) -> Iterator[Fault]:
             "a primitive task cannot raise an external event",
             "drop `by` or make it internal",
         )
+    if e.scope is Scope.INTERNAL and e.memory is EventMemory.LATCHED:
+        text = "an internal event is kept as long as its run is active"
+        yield Fault(f"{key}.memory", text, "drop `memory`, or make the event external")
     if e.early is EarlyEvent.KEEP and (e.scope is Scope.INTERNAL or e.memory is EventMemory.PULSE):
         yield Fault(f"{key}.early", "only a latched external event can be kept", "drop `early`")
     if e.mean_wait is not None:
@@ -258,8 +263,9 @@ def _net(
 
 
 def _copies(key: str, t: Transition, places: Mapping[str, Place]) -> Iterator[Fault]:
-    copies = prod(max(1, places[a.place].tries) for a in t.inputs if a.place in places)
-    if copies > MOST_COPIES:
+    tries = [max(1, places[a.place].tries) for a in t.inputs if a.place in places]
+    copies = prod(tries)
+    if copies > MOST_COPIES and max(tries) <= MOST_TRIES:
         text = f"the `tries` of its input places make {copies} cases of it"
         yield Fault(key, text, f"lower them: {MOST_COPIES} cases are the limit")
 
@@ -304,8 +310,9 @@ def _short_forms(
     }
     for name in (n for n, is_given in given.items() if is_given and not runs):
         yield Fault(f"{key}.{name}", f"a {p.kind} place runs no action", f"drop `{name}`")
-    if p.tries < 1:
-        yield Fault(f"{key}.tries", f"{p.tries} tries", "give 1 or more")
+    if not 1 <= p.tries <= MOST_TRIES:
+        remedy = f"give 1 or more, at most {MOST_TRIES}; for more, lead its error back to the place"
+        yield Fault(f"{key}.tries", f"{p.tries} tries", remedy)
     if p.tries > 1 and p.servers is not None:
         text = "the tries of several tokens in one place cannot be told apart"
         yield Fault(f"{key}.tries", text, "drop `servers`, or use several places")
@@ -318,7 +325,9 @@ def _short_forms(
             text = f"{p.timeout} s is longer than the deadline of {p.task}, {primitive.deadline} s"
             yield Fault(f"{key}.timeout", text, "give less, or raise the deadline")
     if p.listen and p.kind not in (Kind.ACTION, Kind.PLAIN):
-        yield Fault(f"{key}.listen", f"a {p.kind} place listens to nothing", "drop `listen`")
+        yield Fault(
+            f"{key}.listen", f"a place of kind {p.kind} listens to nothing", "drop `listen`"
+        )
     if p.holds and p.kind not in (Kind.ACTION, Kind.PLAIN, Kind.MACRO):
         text = f"a {p.kind} place holds nothing: the operator or another branch may fill it"
         yield Fault(f"{key}.holds", text, "drop `holds`, or leave `kind` out")
@@ -356,7 +365,7 @@ def _arguments_of_macro(
             yield Fault(f"{key}.args.{name}", f"{p.subnet!r} has no such parameter", remedy)
         elif name not in p.args:
             kind = parameters[name]
-            yield Fault(f"{key}.args", f"{name!r} is missing", f"give it as a {kind}")
+            yield Fault(f"{key}.args", f"{name!r} is missing", f"give it; it is of kind {kind}")
         else:
             known = names.written if parameters[name] is Parameter.VARIABLE else names.places
             known = known | set(inside) if parameters[name] is Parameter.PLACE else known
@@ -405,7 +414,7 @@ def _place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
     elif p.task or (p.args and not p.subnet) or p.out or p.servers is not None:
         yield Fault(
             key,
-            f"a {p.kind} place cannot run an action",
+            f"a place of kind {p.kind} cannot run an action",
             "drop task, args, out and servers, or make its kind action",
         )
     if p.kind is Kind.MACRO:
@@ -419,7 +428,7 @@ def _place(names: _Names, key: str, p: Place) -> Iterator[Fault]:
     elif p.subnet:
         yield Fault(
             f"{key}.subnet",
-            f"a {p.kind} place cannot have a subnet",
+            f"a place of kind {p.kind} cannot have a subnet",
             "drop `subnet` or make its kind macro",
         )
 

@@ -146,6 +146,19 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (TASK, '"action", tries', '"action", task = "gripp", tries', r":LINE: .*'gripp'.*mean 'grip'"),
     (TASK, "tries = 3", "tries = 0", r":LINE: places.grip.tries: 0 tries; give 1 or more"),
+    (TASK, "tries = 3", "tries = 101", r":LINE: places.grip.tries: 101 tries; .* at most 100; for"),
+    (
+        TASK,
+        "[places]",
+        '[events]\nshut = { by = "grip", memory = "latched" }\n\n[places]',
+        r"events.shut.memory: an internal event is kept as long as its run is active; drop",
+    ),
+    (
+        TASK,
+        "final_error",
+        'prepare = "move"\nfinal_error',
+        r":LINE: task.prepare: 'move' is an action, and not a service.*\[services.move\] in the",
+    ),
     (
         TASK,
         "tries = 3",
@@ -346,6 +359,12 @@ IN_THE_CELL: list[Mistake] = [
         "arm_bot.py:Axis",
         r":LINE: .*a module is named without .py: .*'arm_bot:",
     ),
+    (
+        CELL,
+        "[actions]",
+        '[services]\nmemory = { node = "pc", run = "arm_bot:grip" }\n[actions]',
+        r"services.memory.run: is built in, and actions use it by `ctx.get` and .*; drop it, or",
+    ),
     (CELL, "arm_bot:grip", "random:grip", r":LINE: .*'random' is Python's own module"),
 ]
 
@@ -382,6 +401,48 @@ IN_THE_CODE: list[Mistake] = [
         "await ctx.sleep(0.3)",
         "import asyncio; await asyncio.sleep(0.3)",
         r"arm_bot.py:\d+: asyncio.sleep does not work in an action; write `await ctx.sleep",
+    ),
+    (
+        CODE,
+        "most = self.speed *",
+        "most = self.speeed *",
+        r"arm_bot.py:\d+: `self.speeed` is set nowhere; did you mean `self.speed`\?",
+    ),
+    (
+        CODE,
+        "self.goal = self.at\n",
+        'self.ports.raise_evnt("stopped")\n',
+        r"arm_bot.py:\d+: `self.ports` has no `raise_evnt`; did you mean `self.ports.raise_event`",
+    ),
+    (
+        CODE,
+        "    return success()",
+        '    return {"held": True}',
+        r"arm_bot.py:\d+: `return {'held': True}` is not a result; write `return success\(\)`",
+    ),
+    (
+        CODE,
+        "return error(",
+        "raise error(",
+        r"arm_bot.py:\d+: `raise error\(.*\)`: a result is returned; write `return`",
+    ),
+    (
+        CODE,
+        'ctx.random("grip")',
+        "ctx.random()",
+        r"arm_bot.py:\d+: `ctx.random\(\)`: missing a required .* it is `ctx.random\(purp",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        'count = ctx.get("held", 0)\n    await ctx.put("held", count + 1)',
+        r"arm_bot.py:\d+: `ctx.get` does nothing without `await`",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        'ctx.publish("speed", slips)\n    await ctx.sleep(0.3)',
+        r"arm_bot.py:\d+: `ctx.publish\('speed', slips\)`: set points are a list of numbers",
     ),
     (
         CODE,
@@ -783,6 +844,15 @@ MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
 READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (  # what a driver raises is no event of the action that names the driver as its device
+        [
+            (TASK, "[places]", "[events.full]\nearly = 'keep'\nmemory = 'latched'\n\n[places]", ""),
+            (CODE, "self.goal = self.at\n", "self.ports.raise_event('full')\n", ""),
+            (CODE, "async def grip(ctx: Context[Remote]", "async def grip(ctx: Context[Axis]", ""),
+        ],
+        "",
+        [],
+    ),
     ([*SEEN, (CODE, "await ctx.sleep(0.3)", "ctx.device.look()", "")], "", []),
     (
         WATCHES,
@@ -1066,6 +1136,8 @@ WARNINGS = (
     "`steps` of",
     "asyncio.sleep",
     "has no `comand`",
+    "has no `raise_evnt`",
+    "is set nowhere",
 )
 
 
@@ -1644,6 +1716,31 @@ def test_a_class_that_cannot_be_hashed_is_read_like_any_other(
     expect(r"arm_bot.py:\d+: `ctx.sleep` does nothing without", CHECK)
 
 
+LIFTING = """\
+[subnets.lifting]
+entry = "lift"
+normal = "up"
+error = "down"
+parameters = { height = "int", speed = "float" }
+[subnets.lifting.places]
+up = {}
+down = {}
+lift = { kind = "action", task = "grip" }
+[subnets.lifting.transitions]
+lifted = { in = ["lift:normal"], out = ["up"] }
+[places.rise]
+kind = "macro"
+subnet = "lifting"
+args = { speed = 9 }
+[transitions.rising]
+in = ["parts"]
+out = ["rise"]
+[transitions.risen]
+in = ["rise:normal"]
+[transitions.sunk]
+in = ["rise:error"]
+"""
+
 TOGETHER: list[list[Mistake]] = [
     [  # each stage of reading: syntax, keys, names, code
         (TASK, 'kind = "resource", tokens', "kind = resource, tokens", r"TOML: resource is a text"),
@@ -1698,6 +1795,44 @@ TOGETHER: list[list[Mistake]] = [
         (TASK, 'grip = { kind = "action"', "grip = { kind = action", r"toml:25: .*action is a"),
         (TASK, 'carry = { kind = "action"', "carry = { kind = action", r"toml:26: .*action is a"),
         (CELL, "arm_bot:grip", "arm_bot:gripp", r"actions.grip.run: .*'gripp'"),
+    ],
+    # A value of a wrong type, and what an element lacks, leave the other elements readable.
+    [
+        (
+            TASK,
+            "final_error",
+            'prepare = ["ready"]\nfinal_error',
+            r"prepare: .'ready'. is not a text",
+        )
+    ],
+    [(TASK, 'to = "broken"', 'to = ["broken"]', r"errors.to: .'broken'. is not a text")],
+    [(TASK, 'to = "broken"', 'to = "fetch"', r"errors.to: 'fetch' is an action place whose own")],
+    [(TASK, "tries = 3", "tries = 100000", r"grip.tries: 100000 tries")],
+    [
+        (
+            TASK,
+            '{ slipped = "the part slipped out" }',
+            '["slipped"]',
+            r"error_causes: .'slipped'. is not a table",
+        )
+    ],
+    [(TASK, "[errors]", f"{LIFTING}[errors]", r"rise.args: 'height' is missing; give it")],
+    [
+        (
+            TASK,
+            "[errors]",
+            LIFTING.replace('normal = "up"\n', "").replace("9", "9, height = 1") + "[errors]",
+            r"subnets.lifting.normal: missing; give a text",
+        )
+    ],
+    [(CELL, 'run = "arm_bot:grip"', 'run = "arm_bot:Axis"', r"grip.run: 'arm_bot:Axis' is a cl")],
+    [
+        (
+            CODE,
+            "move(ctx: Context[Remote], *, to:",
+            "move(*, to:",
+            r"move takes no context; its first",
+        )
     ],
     [  # nothing can be read of the task: its brace ends nowhere
         (TASK, "[transitions]", "[transitions", r"arm_bot.toml:28: not valid TOML"),

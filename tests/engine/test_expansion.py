@@ -555,7 +555,7 @@ def test_conditions_of_the_same_step_read_the_old_value() -> None:
         ),
         (SHORT, "timeout = 2.0", "tries = 0", "places.grasp.tries", "1 or more"),
         (SHORT, "timeout = 2.0", "tries = 2\nservers = 2", "places.grasp.tries", "drop `servers`"),
-        (SHORT, "timeout = 2.0", "tries = 5000", "transitions.grasped", "1000 cases"),
+        (SHORT, "timeout = 2.0", "tries = 5000", "places.grasp.tries", "at most 100"),
         (
             SHORT,
             "timeout = 2.0",

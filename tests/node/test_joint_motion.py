@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot import Axis, Driver, JointMotion, check_driver
+from petrobot.services.device import faults_of_keys
 
 LIMITS = {"lift": (-1.5, 1.5), "turn": (-3.0, 3.0)}
 DT = 0.02
@@ -268,10 +269,10 @@ def test_what_an_axis_refuses_leaves_it_where_it_is(body: dict[str, Any], words:
         ({"ends": [0.0]}, "ends: expected 2 finite numbers"),
         ({"ends": [0.0, 1.0]}, r"stations: high lies beyond the ends \[0.0, 1.0\] m"),
         ({"stations": {"low": "0.2"}}, "stations.low: expected 1 finite numbers, found"),
-        ({"top_speed": 0.0}, "top_speed, acceleration: expected numbers above 0, found 0 and 2"),
+        ({"top_speed": 0.0}, "top_speed: expected a number above 0, found 0"),
         (
             {"acceleration": -1},
-            "top_speed, acceleration: expected numbers above 0, found 0.8 and -1",
+            "acceleration: expected a number above 0, found -1",
         ),
         ({"top_sped": 1.0}, "top_sped: .*top_speed"),
     ],
@@ -279,6 +280,15 @@ def test_what_an_axis_refuses_leaves_it_where_it_is(body: dict[str, Any], words:
 def test_keys_of_an_axis_that_make_no_sense_are_refused(keys: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         Lift(keys, None)
+    assert [name for name, _ in faults_of_keys(Lift, keys)], "a check finds it, too"
+
+
+def test_an_axis_is_between_its_ends_when_it_is_set_up() -> None:
+    class Up(Lift):
+        def setup(self) -> None:
+            self.first = self.at
+
+    assert Up({"stations": {"low": 0.2, "high": 1.2}}, None).first == 0.2
 
 
 def test_an_axis_without_stations_moves_between_its_ends() -> None:

@@ -58,9 +58,12 @@ def code_findings(
     each timer."""
     given = {"prepare": {*task.parameters, "seed", "runs"}, "score": {"cycles"}}
     for key, service in (("prepare", task.prepare), ("score", task.score)):
-        if service and service not in services and service not in args:
+        if service and service not in services:
             text = f"there is no service {service!r}{nearest(service, services)}"
             remedy = f"declare [services.{service}] in the location file, or drop the key"
+            if service in args:
+                text = f"{service!r} is an action, and not a service"
+                remedy = f"move it to [services.{service}] in the location file, or drop the key"
             yield Finding(Severity.ERROR, "no-service", f"task.{key}", text, remedy)
         elif text := _called(key, service, services.get(service, {}), given[key]):
             remedy = f"write its parameters as `ctx, *, {listed(given[key])}`"

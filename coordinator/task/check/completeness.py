@@ -240,8 +240,8 @@ def translating_others(task: Task, translates: Mapping[str, str], source: str) -
         if said not in choosers:
             key = f"primitive_tasks.{choosers[0]}.alternatives"
             text = (
-                f"{source} says that the action {action!r} translates {said!r}, which "
-                "does not name it"
+                f"{source} says that the action {action!r} does the primitive task {said!r}, "
+                "which does not name it"
             )
             remedy = (
                 f"write task = {' or '.join(map(repr, choosers))} in its "

@@ -151,7 +151,7 @@ def code_faults(directory: Directory, code: Mapping[str, Facts], text: str) -> t
         unread(f"devices.{device.name}.driver", device.driver)
         facts = code.get(device.driver, {})
         for key, said in facts.get("keys", {}).get(device.name, ()):
-            faults.add(f"devices.{device.name}.{key}", said)
+            faults.add(f"devices.{device.name}.{key}", said.removeprefix(f"{key}: "))
     return (*faults.lines, *dict.fromkeys(_streams(directory, code)), *_memory(directory, code))
 
 
@@ -167,17 +167,20 @@ def _memory(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:
 
 def _streams(directory: Directory, code: Mapping[str, Facts]) -> Iterator[str]:
     """Return the streams that the code uses and the location file does not have, or directs to
-    another device."""
+    another device; each name once."""
+    told = set[str]()
     for device in directory.devices.values():
         for name, (file, line) in code.get(device.driver, {}).get("streams", {}).items():
             entry = directory.streams.get(name)
             if entry is None or entry.to != device.name:
                 what = "is not declared" if entry is None else f"leads to {entry.to!r}"
                 remedy = f'write [streams.{name}] to = "{device.name}" in {directory.source}'
+                remedy += nearest(name, directory.streams) if entry is None else ""
+                told.add(name)
                 yield f"{file}:{line}: the stream {name!r} {what}; {remedy}"
     for path in dict.fromkeys(action.run for action in directory.actions.values()):
         for name, (file, line) in code.get(path, {}).get("streams", {}).items():
-            if name not in directory.streams:
+            if name not in directory.streams and name not in told:
                 hint = nearest(name, directory.streams)
                 remedy = f"declare [streams.{name}] in {directory.source}{hint}"
                 yield f"{file}:{line}: the stream {name!r} is not declared; {remedy}"

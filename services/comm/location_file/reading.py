@@ -326,6 +326,9 @@ def _check_places(tables: Tables, faults: Faults, memory: str) -> None:
                 f"services.{name}.run",
                 f'is missing; write an import path (only "{memory}" is built in)',
             )
+        elif "run" in entry and name == memory:
+            text = "is built in, and actions use it by `ctx.get` and `ctx.put`"
+            faults.add(f"services.{name}.run", f"{text}; drop it, or rename your service")
     for name, entry in tables["streams"].items():
         if entry["to"] not in devices:
             faults.add(
