@@ -428,16 +428,20 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
         if p.subnet
         else f"macro place of {listed(inside - {p.name})}",
     }[p.kind]
-    lines = [p.label or p.name]
-    if p.kind is Kind.ACTION and p.task != p.name:
-        lines.append(f"({p.task})")
-    if p.in_short:
-        lines.append(p.in_short)
+    runs = p.task if p.kind is Kind.ACTION and p.task != p.name else ""
+    under = ", ".join(filter(None, (p.subnet, runs, task.in_short(p))))
     capacity = f", at most {p.capacity}" if p.capacity is not None else ""
     hint = f"{p.name}: {what}{capacity}"
     style = f"place {p.kind}" + (" error" if p.name in task.error_elements else "")
     return DrawnNode(
-        p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden
+        p.name,
+        True,
+        at,
+        style,
+        tuple(filter(None, (p.label or p.name, under))),
+        hint,
+        sheet.tokens.get(p.name, 0),
+        hidden,
     )
 
 

@@ -50,13 +50,13 @@ def picture(task: Task) -> dict[str, Any]:
         "places": [
             *(
                 {
-                    **_place(flat.places.get(name, p), p, name in errors),
+                    **_place(flat.places.get(name, p), task.in_short(p), name in errors),
                     "name": name,
                     "in_macro": prefix + p.macro if p.macro else prefix.removesuffix("."),
                 }
                 for name, (p, prefix) in places.items()
             ),
-            *(_place(p, p, False) for name, p in flat.places.items() if name not in places),
+            *(_place(p, "", False) for name, p in flat.places.items() if name not in places),
         ],
         "transitions": [
             _transition(t, originals[t.name], flat, t.name in errors)
@@ -89,7 +89,7 @@ def _made(t: Transition, written: Mapping[str, Transition]) -> Transition:
     return replace(t, expanded_from=origin) if origin in written else t
 
 
-def _place(place: Place, written: Place, error: bool) -> dict[str, Any]:
+def _place(place: Place, in_short: str, error: bool) -> dict[str, Any]:
     return {
         "name": place.name,
         "kind": place.kind.value,
@@ -101,7 +101,7 @@ def _place(place: Place, written: Place, error: bool) -> dict[str, Any]:
         "tokens": place.tokens,
         "capacity": place.capacity,
         "servers": place.servers,
-        "in_short": written.in_short,
+        "in_short": in_short,
         "primitive_task": place.task,
         "subnet": place.subnet,
         "args": {

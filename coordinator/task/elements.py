@@ -212,17 +212,6 @@ class Place:
         """Action place: the most runs that are active at once; further tokens queue."""
         return self.servers or 1
 
-    @property
-    def in_short(self) -> str:
-        """What its short forms declare: a drawing writes it instead of the elements they make."""
-        parts = (
-            f"{self.tries} tries" if self.tries > 1 else "",
-            f"{self.timeout:g} s" if self.timeout is not None else "",
-            f"holds {', '.join(self.holds)}" if self.holds else "",
-            "listens" if self.listen else "",
-        )
-        return ", ".join(filter(None, parts))
-
 
 @dataclass(frozen=True, slots=True)
 class Input:

@@ -137,6 +137,27 @@ class Task:
                     new += takers.get(place, ())
         return frozenset(places | transitions)
 
+    def in_short(self, place: Place) -> str:
+        """Return what the short forms of a place of the file declare: a drawing writes it instead
+        of the elements that they make."""
+        inside = [r for r in self._held_inside(place) if r not in place.holds]
+        parts = (
+            f"{place.tries} tries" if place.tries > 1 else "",
+            f"{place.timeout:g} s" if place.timeout is not None else "",
+            f"holds {', '.join(place.holds)}" if place.holds else "",
+            f"holds {', '.join(inside)} inside" if inside else "",
+            "listens" if place.listen else "",
+        )
+        return ", ".join(filter(None, parts))
+
+    def _held_inside(self, macro: Place) -> list[str]:
+        """Return the resources around a macro place that places of its subnet hold."""
+        if not macro.subnet:
+            return []
+        places = self.subnets[macro.subnet].places
+        held = (r for p in places.values() for r in (*p.holds, *self._held_inside(p)))
+        return [macro.args.get(r, r) for r in dict.fromkeys(held) if r not in places]
+
     def primitive_task_of(self, place: str) -> PrimitiveTask:
         """Return the primitive task of an action place of the flat task. Raises KeyError."""
         return self.primitive_tasks[self.flat.places[place].task]

@@ -256,7 +256,14 @@ def test_the_page_draws_the_arcs_and_error_branches_that_show_draws(text: str) -
     assert errors == exits
     told = {p["name"]: p["in_short"] for p in page["places"] if not p["in_macro"]}
     for name, words in told.items():
-        assert name in made or not words or words in scene.nodes[name].lines
+        assert name in made or words in scene.nodes[name].lines[-1]
+
+
+def test_a_macro_place_says_what_is_held_inside() -> None:
+    """So a resource without an arc is not a riddle; a parameter has the name of what it stands
+    for."""
+    task = loads(HELD)
+    assert task.in_short(task.places["fetch"]) == "holds arm inside"
 
 
 HELD = """schema = 1

@@ -51,14 +51,27 @@ function arcs(net, transitions, shown) {
   return [...joined.values()];
 }
 
-/** What the short forms of a place declare, as `Place.in_short` words it. */
-const inShort = (p) => [p.tries > 1 && `${p.tries} tries`, p.timeout !== undefined && `${p.timeout} s`, listed(p.holds).length && `holds ${listed(p.holds).join(", ")}`, p.listen && "listens"].filter(Boolean).join(", ");
+/** What the short forms of a place declare, as `Task.in_short` words it. */
+function inShort(data, p) {
+  const own = listed(p.holds);
+  const inside = heldInside(data, p).filter((name) => !own.includes(name));
+  const parts = [p.tries > 1 && `${p.tries} tries`, p.timeout !== undefined && `${p.timeout} s`, own.length && `holds ${own.join(", ")}`, inside.length && `holds ${inside.join(", ")} inside`, p.listen && "listens"];
+  return parts.filter(Boolean).join(", ");
+}
+
+/** The resources around a macro place that places of its subnet hold; a subnet within itself is a mistake that `check` tells. */
+function heldInside(data, macro, path = []) {
+  const places = data.subnets?.[macro.subnet]?.places;
+  if (macro.kind !== "macro" || !places || path.includes(macro.subnet)) return [];
+  const held = Object.values(places).flatMap((p) => [...listed(p.holds), ...heldInside(data, p, [...path, macro.subnet])]);
+  return [...new Set(held)].filter((name) => !places[name]).map((name) => macro.args?.[name] ?? name);
+}
 
 function placeOf(data, net, name, p, errors) {
   const inside = groups(p) ? within(net, name) : [];
   const isError = errors.has(name) || (inside.some((n) => errors.has(n)) && inside.every((n) => errors.has(n) || groups(net.places?.[n])));
   const hint = inside.length ? `${name}\nholds ${inside.join(", ")}` : name;
-  const sub = underPlace({ name, kind: p.kind, subnet: p.subnet, primitive_task: p.task ?? name, in_short: inShort(p) });
+  const sub = underPlace({ name, kind: p.kind, subnet: p.subnet, primitive_task: p.task ?? name, in_short: inShort(data, p) });
   return { name, kind: p.kind ?? "plain", label: p.label ?? "", x: p.x, y: p.y, tokens: tokensIn(data, net, name), sub, error: isError, hint };
 }
 
