@@ -331,6 +331,15 @@ def _alternatives(task: Task, moves: Sequence[Move]) -> list[list[Move]]:
     return [members for _, members in groups if any(m.open_ and not m.waits for m in members)]
 
 
+def _soonest(times: Values) -> tuple[Codes, Values]:
+    """Return the row with the least time in each column, and that time: never, without a row."""
+    columns = np.arange(times.shape[1])
+    if not len(times):
+        return np.zeros(len(columns), np.int64), np.full(len(columns), np.inf)
+    row: Codes = times.argmin(axis=0)
+    return row, times[row, columns]
+
+
 class Play:
     """Active trials; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
@@ -398,7 +407,7 @@ class Play:
         self._devices = range(len(names))
         self._servers = [task.places[p].most_active for p in places]
         self._at_once = np.array([task.primitive_task_of(p).start is Start.AT_ONCE for p in places])
-        self._awaited = np.array([not task.places[p].listen for p in places])
+        self._awaited = np.array([not task.places[p].listen for p in places], np.bool_)
         self._column = np.arange(n)
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._taken = np.zeros(n, np.bool_)
@@ -722,10 +731,7 @@ class Play:
 
     def _advance(self, due: Values) -> None:
         """On to the next end of a run or of a wait in each column."""
-        run = self._runs.end.argmin(axis=0)
-        ends = self._runs.end[run, np.arange(len(run))]
-        i = due.argmin(axis=0) if len(due) else np.zeros(len(run), np.int64)
-        dues = due[i, np.arange(len(run))] if len(due) else np.full(len(run), np.inf)
+        (run, ends), (i, dues) = _soonest(self._runs.end), _soonest(due)
         soonest = np.minimum(ends, dues)
         moving = np.isfinite(soonest)
         self._now = np.where(moving, soonest, self._now)

@@ -239,6 +239,28 @@ b_lost: b:error -> end
     assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
 
 
+def test_a_task_without_an_action_place_takes_as_long_as_its_timers() -> None:
+    text = """
+schema = 1
+[task]
+name = "timers"
+final = "end == 1"
+[places]
+jobs = { kind = "control", tokens = 1 }
+half = {}
+end = { kind = "control" }
+[transitions]
+begin = { in = ["jobs"], out = ["half"], after = 1.5 }
+done = { in = ["half"], out = ["end"], after = 2.0 }
+"""
+    training = Training.of(loads(text), [Trial(1, 0.0)])
+    random = np.random.default_rng(1)
+    drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, 1)), random)
+    structure = Structure.of(training.task)
+    played = Play(structure, drawer, choices_of(training), np.zeros(5, np.int64)).run()
+    assert played.time.tolist() == [3.5] * 5
+
+
 @pytest.mark.parametrize(("listening", "time"), [("", 3.0), ("b", 1.0)])
 def test_a_trial_does_not_end_while_a_run_is_active_unless_it_only_listens(
     listening: str, time: float
