@@ -558,6 +558,15 @@ def test_conditions_of_the_same_step_read_the_old_value() -> None:
         (SHORT, "timeout = 2.0", "tries = 5000", "places.grasp.tries", "at most 100"),
         (
             SHORT,
+            "[places.in_hand]",
+            '[places.a]\nkind = "action"\ntask = "put"\ntries = 40\n\n'
+            '[places.b]\nkind = "action"\ntask = "put"\ntries = 40\n\n'
+            '[transitions.both]\nin = ["a:normal", "b:normal"]\n\n[places.in_hand]',
+            "transitions.both",
+            "1600 cases of it",
+        ),
+        (
+            SHORT,
             "timeout = 2.0",
             "retry_unknown = true",
             "places.grasp.retry_unknown",
