@@ -125,7 +125,7 @@ def place(folder: Path, driver: str = "Axis", keys: str = "") -> Path:
     ("driver", "keys", "says"),
     [
         ("Axis", "speed = 0.25\nworkspace = { x = [0.0, 1.0] }\ndry_run = true", ""),
-        ("Deaf", "speed = 0.25", "devices.axis.speed: speed: Deaf does not obey it"),
+        ("Deaf", "speed = 0.25", "devices.axis.speed: Deaf does not obey it"),
         ("Deaf", "workspace = { x = [0, 1] }", "workspace: Deaf does not obey it"),
         ("Deaf", "dry_run = true", "dry_run: Deaf does not obey it"),
         ("Axis", "speed = 0", "expected a number above 0 and at most 1, the share"),
@@ -156,7 +156,7 @@ def test_a_dry_run_is_refused_where_a_driver_cannot(
     place(cell, "Deaf")
     assert main([*command, "--dry-run"]) == 2
     told = capsys.readouterr().err
-    assert "devices.axis.dry_run: dry_run: Deaf does not obey it" in told
+    assert "devices.axis.dry_run: Deaf does not obey it" in told
     assert "Sensor" not in told and "Button" not in told
 
 

@@ -198,7 +198,7 @@ def test_an_action_for_another_primitive_task_is_a_warning(petrobot: Petrobot) -
     found = " ".join(out.split())
     assert (
         "warning work.toml:12: primitive_tasks.work.alternatives: services.toml says that "
-        "the action 'work' translates 'wrok'" in found
+        "the action 'work' does the primitive task 'wrok'" in found
     )
     assert "write task = 'work' in its [actions.work]" in found
 

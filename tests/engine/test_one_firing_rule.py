@@ -210,6 +210,7 @@ class Frozen(Play):
             assert not (able & ~rows).any()
             columns = np.flatnonzero(able)
             phases, taken = self._runs.phase.copy(), self._taken.copy()
+            entered = self._runs.entered.copy()  # a run that enters may get the row of one taken
             told = self._variables.valuation.copy()
             self._fire(move, columns)
             self._variables.valuation = told
@@ -218,6 +219,7 @@ class Frozen(Play):
                 assert tuple(self._tokens[:, i].tolist()) == expected, move.name
             self._tokens, self._taken = before, taken
             self._runs.phase[: len(phases)], self._runs.phase[len(phases) :] = phases, IDLE
+            self._runs.entered[: len(entered)] = entered
 
 
 def forecast_agrees(task: Task, states: list[State]) -> None:
