@@ -930,7 +930,8 @@ def _own_names(thing: type) -> list[str] | None:
     stored = {
         n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)
     }
-    return sorted(stored | {*dir(thing), *keys_of(thing), *LIMITS, "ports"})
+    declared = {name for base in thing.__mro__ for name in inspect.get_annotations(base)}
+    return sorted(stored | declared | {*dir(thing), *keys_of(thing), *LIMITS, "ports"})
 
 
 def _methods(thing: type[Driver], seen: _Seen) -> None:

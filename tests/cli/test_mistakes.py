@@ -844,6 +844,11 @@ MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
 READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        [(CODE, "most = self.speed *", "most = self.speeed *", "")],
+        "`self.speeed` is set nowhere",
+        [(CODE, "top_speed: float = key", "speeed: float\n    top_speed: float = key", "")],
+    ),
     (  # what a driver raises is no event of the action that names the driver as its device
         [
             (TASK, "[places]", "[events.full]\nearly = 'keep'\nmemory = 'latched'\n\n[places]", ""),
