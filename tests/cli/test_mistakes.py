@@ -845,6 +845,11 @@ READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
     (
+        [(TASK, "move = { ", 'move = { cost = "value:way", ', "")],
+        "primitive_tasks.move.cost: the action 'move' returns no value 'way'",
+        [(CODE, "return success(at", "return success(way=1.0, at", "")],
+    ),
+    (
         [(CODE, "most = self.speed *", "most = self.speeed *", "")],
         "`self.speeed` is set nowhere",
         [(CODE, "top_speed: float = key", "speeed: float\n    top_speed: float = key", "")],

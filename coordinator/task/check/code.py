@@ -82,6 +82,7 @@ def code_findings(
     for primitive in task.primitive_tasks.values():
         yield from _causes(primitive, code)
         yield from _too_long(primitive, code)
+        yield from _costs(primitive, code)
     if code.keys() >= args.keys():
         yield from _never_written(used, code, services.values())
     yield from _unraised(task, code)
@@ -326,6 +327,19 @@ def _causes(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
         text = f"its actions also return {listed(undeclared)}"
         remedy = "declare each with a sentence for people"
         yield Finding(Severity.WARNING, "code", key, text, remedy)
+
+
+def _costs(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
+    """The value of the result that is the cost, where an action never returns it."""
+    kind, _, name = primitive.cost.partition(":")
+    for action in primitive.alternatives if kind == "value" else ():
+        facts = code.get(action, {})
+        known = sorted(facts.get("values", ()))
+        if facts.get("complete") and name not in known:
+            text = f"the action {action!r} returns no value {name!r}{nearest(name, known)}"
+            remedy = f"return it (success({name}=...)), or write another cost"
+            key = f"primitive_tasks.{primitive.name}.cost"
+            yield Finding(Severity.WARNING, "code", key, text, remedy)
 
 
 def _unraised(task: Task, code: Code) -> Iterator[Finding]:
