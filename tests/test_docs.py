@@ -135,6 +135,18 @@ def test_no_page_is_too_long() -> None:
     assert long == {}
 
 
+def test_lines_of_prose_have_their_width() -> None:
+    """Not in tables, pictures, links to other places, and what a program prints."""
+    wide, in_block = [], False
+    for page in [*PAGES, *sorted((ROOT / "docs").glob("*/*.md"))]:
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
+            in_block ^= line.startswith("```")
+            free = in_block or page.name == "figures-analysis.md" or "http" in line
+            if len(line) > 100 and not free and not line.startswith(("|", "![")):
+                wide.append(f"{page.name}:{number}")
+    assert wide == []
+
+
 def test_the_figures_are_those_that_were_measured() -> None:
     """docs/figures.md is made from figures.json. Whether the measured code is still the same is
     for `make proof` to say, so it is left out here."""
