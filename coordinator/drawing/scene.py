@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from petrobot.coordinator.drawing.layout import Edge, Point, lay_out, lay_out_blocks
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
-from petrobot.coordinator.task.expansion import macros_around, with_error_branches
+from petrobot.coordinator.task.expansion import macros_around, net_inside, with_error_branches
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import listed
 
@@ -98,15 +98,7 @@ def _opened(task: Task, inside: str) -> tuple[Task, str, str]:
                 f"{task.name} has no macro place {inside!r}; it has {known or 'none'} at that level"
             )
         if place.subnet:
-            subnet = task.subnets[place.subnet]
-            net = with_error_branches(
-                replace(
-                    task,
-                    places=subnet.places,
-                    transitions=subnet.transitions,
-                    errors_to=subnet.errors_lead_to,
-                )
-            )
+            net = net_inside(task, place)
             prefix = f"{prefix}{part}."
         else:
             group = part

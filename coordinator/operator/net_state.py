@@ -16,7 +16,7 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
-from petrobot.coordinator.task.expansion import with_error_branches
+from petrobot.coordinator.task.expansion import net_inside, with_error_branches
 
 
 def picture(task: Task) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def picture(task: Task) -> dict[str, Any]:
     forms add to them."""
     flat = task.flat
     errors = flat.error_elements
-    nets = list(_nets(task, ""))
+    nets = list(_nets(with_error_branches(task), ""))
     places = {prefix + p.name: (p, prefix) for prefix, net in nets for p in net.places.values()}
     written = {
         prefix + t.name: replace(t, expanded_from="")
@@ -67,20 +67,11 @@ def picture(task: Task) -> dict[str, Any]:
 
 
 def _nets(net: Task, prefix: str) -> Iterator[tuple[str, Task]]:
-    """Return the net of the file and those of its macro places, with the exits that `[errors]`
-    adds, each with the prefix of its names."""
-    net = with_error_branches(net)
+    """Yield a net and those of its macro places, each with the prefix of its names."""
     yield prefix, net
     for place in net.places.values():
         if place.subnet:
-            subnet = net.subnets[place.subnet]
-            inner = replace(
-                net,
-                places=subnet.places,
-                transitions=subnet.transitions,
-                errors_to=subnet.errors_lead_to,
-            )
-            yield from _nets(inner, f"{prefix}{place.name}.")
+            yield from _nets(net_inside(net, place), f"{prefix}{place.name}.")
 
 
 def _made(t: Transition, written: Mapping[str, Transition]) -> Transition:

@@ -97,6 +97,15 @@ def with_error_branches(task: Task) -> Task:
     return task if added is task.transitions else replace(task, transitions=added)
 
 
+def net_inside(task: Task, place: Place) -> Task:
+    """Return the net of a macro place's subnet, with the error branches that its `[errors]`
+    adds."""
+    subnet = task.subnets[place.subnet]
+    places, transitions = subnet.places, subnet.transitions
+    inner = replace(task, places=places, transitions=transitions, errors_to=subnet.errors_lead_to)
+    return with_error_branches(inner)
+
+
 def _with_error_branches(
     places: Places, transitions: Transitions, subnets: Mapping[str, Subnet], to: str
 ) -> Transitions:
