@@ -203,7 +203,7 @@ def _with_code(
     by_action = {
         action.name: {**code[action.run], "device": code.get(_driver(directory, action.device), {})}
         for action in actions
-        if action.run in code and "classes" not in code[action.run]  # a class is no action
+        if action.run in code and "classes" not in code[action.run]  # a class is not an action
     }
     args = {action.name: action.args for action in actions}
     drivers = {device.name: code.get(device.driver, {}) for device in directory.devices.values()}

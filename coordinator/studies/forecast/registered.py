@@ -228,7 +228,7 @@ def contradictions(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[str
 
 def unlike_trials(said: Mapping[str, Any], view: Mapping[str, Any]) -> str:
     """Return in words which figures of the stochastic view the trials contradict, from which the
-    figures of the forecast come; empty if none. Such a view is no part of the forecast."""
+    figures of the forecast come; empty if none. Such a view is left out of the forecast."""
     apart = _apart(said, view) if said["from"] == TRIALS else []
     if not apart:
         return ""
