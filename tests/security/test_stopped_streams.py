@@ -53,9 +53,14 @@ async def drive(ctx):
 
 
 async def position(directory: Directory) -> float:
-    """Where the cart is."""
-    told = await ask_all(directory, 5.0)
-    return float(told["left"]["status"]["devices"]["cart"]["state"]["at"])
+    """Where the cart is, as soon as the process of its driver is ready."""
+    limit = Limit("the state of the cart")
+    while limit.left():
+        told = (await ask_all(directory, 5.0))["left"].get("status") or {"devices": {"cart": {}}}
+        if state := told["devices"]["cart"].get("state"):  # none while the process starts
+            return float(state["at"])
+        await beat(0.05)
+    raise AssertionError
 
 
 async def moves(directory: Directory) -> bool:
