@@ -19,22 +19,20 @@ chosen its action waits until it is free. Devices that never have to be waited f
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-
-from petrobot.coordinator.analysis.net.graph import Graph
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView, contended
 from petrobot.coordinator.analysis.net.structure import (
     exclusive_places,
     place_bounds,
     place_semiflows,
 )
+from petrobot.coordinator.analysis.time.firing_order import firing_order
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import (
     DECLARED,
@@ -74,7 +72,6 @@ from petrobot.coordinator.task.conditions.language import Scalar, as_literal, wi
 from petrobot.coordinator.task.conditions.regions import can_hold, region_values
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.validation import condition_domains, is_pulse
-from petrobot.coordinator.task.wording import few
 
 FLUSH, TASK, CHOICE = 3_000_000, 1_000_000, 500_000
 """Priorities of flushing, of the task's transitions (above TASK in their order) and of choosing. As
@@ -141,26 +138,6 @@ def timer_key(transition: str) -> str:
 
 def _cut(counts: Counts | None) -> str:
     return LOST if counts in (Counts.FAILURE, Counts.ERROR) else KEPT
-
-
-Edges = set[tuple[int, int]]
-
-
-def _groups(n: int, edges: Edges) -> list[int]:
-    """Return the number of the strong component of each vertex."""
-    pairs = np.array(sorted(edges), np.int32).reshape(-1, 2)
-    found: list[int] = Graph(n, pairs[:, 0], pairs[:, 1]).components.tolist()
-    return found
-
-
-def _levels(n: int, edges: Edges) -> list[int]:
-    """Return a number for each vertex that grows along the edges, except within a cycle."""
-    group, level = _groups(n, edges), [0] * n
-    links = {(group[i], group[j]) for i, j in edges if group[i] != group[j]}
-    while late := [(i, j) for i, j in links if level[j] <= level[i]]:
-        for i, j in late:
-            level[j] = level[i] + 1
-    return [level[g] for g in group]
 
 
 Needs = tuple[dict[int, int], dict[int, int]]
@@ -447,7 +424,16 @@ class _Derivation:
             for t in self.task.transitions.values()
             if not self.compiled[t.name].never and any(case.open_ for case in self._cases(t))
         }
-        self.turns = self._turns()
+        # An open condition is drawn against its competitors, so its priority, which decides only
+        # where it holds, must not decide the draw.
+        drawn = [
+            (name, rival)
+            for name in self.switched
+            for rival in self._rivals(self.task.transitions[name])
+        ]
+        reads = {name: set(condition.names) for name, condition in self.conditions.items()}
+        self.turns, rings = firing_order(list(self.compiled.values()), reads, drawn)
+        self.doubts += rings
         for event in self.task.events.values():
             if event.scope is Scope.EXTERNAL:
                 self._event(event)
@@ -962,80 +948,6 @@ class _Derivation:
         return least, below
 
     # Transitions of the task.
-
-    def _turns(self) -> Weights:
-        """Return a number for each transition: of those that can fire at once, the one with the
-        highest number does so first.
-
-        By rank; among equals as in a step of the engine, whose transitions are all judged in one
-        marking. So a transition comes after those that it spoils, and after those that compete
-        with, spoil or are spoiled by what it enables. What competes for tokens, or spoils each
-        other, keeps one number: only a draw decides that. So does a longer ring, whose order in the
-        engine depends on which of its transitions can fire: a doubt.
-        """
-        moves = list(self.compiled.values())
-        takers, barred, readers, setters = (defaultdict[Any, set[int]](set) for _ in range(4))
-        for i, x in enumerate(moves):
-            ends = [(a.place, str(a.end)) for a in x.actions if a.end is not End.GOING]
-            for kind in [*ends, *((p, "") for p, _ in x.plain)]:
-                takers[kind].add(i)
-            for p, _ in x.bars:
-                barred[p].add(i)
-            for name, value in x.sets:
-                setters[name].add(i)
-                for read in value.names:
-                    readers[read].add(i)
-            for name in self.conditions[x.name].names if x.name in self.conditions else ():
-                readers[name].add(i)
-        rank = [x.rank for x in moves]
-        # An open condition is drawn against its competitors, so its priority, which decides only
-        # where it holds, must not decide the draw.
-        index = {x.name: i for i, x in enumerate(moves)}
-        drawn = [
-            (index[name], index[rival])
-            for name in self.switched
-            for rival in self._rivals(self.task.transitions[name])
-        ]
-        while above := [(i, j) for i, j in drawn if rank[i] < rank[j]]:
-            for i, j in above:
-                rank[j] = min(rank[i], rank[j])
-        ranks = defaultdict[Any, set[int]](set)
-        for i, own in enumerate(rank):
-            ranks[own].add(i)
-        equal = [ranks[own] for own in rank]
-        rivals, spoils, enables = ([set[int]() for _ in moves] for _ in range(3))
-        for group in (*takers.values(), *setters.values()):
-            for i in group:
-                rivals[i] |= group & equal[i]
-        for i, x in enumerate(moves):
-            for p, n in x.changes:
-                (spoils if n > 0 else enables)[i].update(barred[p])
-                enables[i] |= takers[p, ""] if n > 0 else set()
-            for name, _ in x.sets:
-                spoils[i] |= readers[name]
-                enables[i] |= readers[name]
-        disturbs = [set[int](r | s) for r, s in zip(rivals, spoils, strict=True)]
-        for i, spoiled in enumerate(spoils):
-            for j in spoiled:
-                disturbs[j].add(i)
-        # (i, j): i comes before j. `soon` matters less, so it yields where the two contradict.
-        hard, soon = Edges(), Edges()
-        for j in range(len(moves)):
-            hard |= {(i, j) for i in (spoils[j] & equal[j]) | rivals[j]}
-            first = set[int]().union(*(disturbs[k] for k in enables[j]))
-            soon |= {(i, j) for i in first & equal[j]}
-        spoiling = {(i, j) for j in range(len(moves)) for i in spoils[j] & equal[j]}
-        rings = _groups(len(moves), spoiling)
-        lost = {rings[i] for i, j in spoiling if rings[i] == rings[j] and (j, i) not in hard}
-        for number in sorted(lost):
-            names = few([x.name for x, n in zip(moves, rings, strict=True) if n == number])
-            text = "each keeps the next one from firing, in a ring, so a draw decides who is first"
-            self.doubts.append(f"{names}: {text}")
-        ring = _groups(len(moves), hard | soon)
-        level = _levels(len(moves), hard | {(i, j) for i, j in soon if ring[i] != ring[j]})
-        keys = list(zip(rank, level, strict=True))
-        order = sorted(set(keys), reverse=True)
-        return {x.name: order.index(key) for x, key in zip(moves, keys, strict=True)}
 
     def _transition(self, t: Transition) -> None:
         if self.compiled[t.name].never:
