@@ -410,6 +410,8 @@ def text_of(result: dict[str, Any]) -> str:
         times = (
             "" if part["mean"] is None else f"  mean {part['mean']:.3f} s, 90 % {part['q90']:.3f} s"
         )
+        if untimed := part.get("untimed"):  # absent in older results
+            times += f" (without {untimed} trials that have no time: some token was not back)"
         lines.append(
             f"  {name or '-':{wide}}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}"
         )

@@ -355,9 +355,10 @@ class LearningSelector(FirstAlternative):
             return
         self._latest = number
         for trial in [*self._open.values()]:
-            if trial.met is None and trial.goals:
-                self._judge(now, trial, True)  # otherwise it is unknown whether it met the goal
-            if not self._tokens.on_its_way(trial.number):
+            over = not self._tokens.on_its_way(trial.number)
+            if trial.met is None and (trial.goals or over):
+                self._judge(now, trial, trial.goals > 0 or not self._goals)
+            if over:
                 # The task could take the next token, so this one is completed.
                 trial.completed = True
                 self._count_if_stopped(trial)

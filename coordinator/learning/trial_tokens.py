@@ -33,6 +33,10 @@ class TrialTokens:
         taken = {p for arcs in net.consume for p, _ in arcs}
         self._sinks = set(range(len(net.places))) - taken - self._fatal
         """Places where a token stays for ever, such as a counter of products."""
+        self._listening = {net.place_index[p.name] for p in flat.places.values() if p.listen}
+        resources = {p.name for p in flat.places.values() if p.kind is Kind.RESOURCE}
+        self._settled = self._sinks | self._listening | {net.place_index[p] for p in resources}
+        """Places where a token of no trial keeps no trial from its end, as in `final`."""
         self._free = [*net.initial]
         """By place: its tokens of no trial."""
         self._waiting: defaultdict[int, deque[int]] = defaultdict(deque)
@@ -41,13 +45,16 @@ class TrialTokens:
         self._runs: dict[str, int] = {}
         self._live: Counter[int] = Counter()
         self._borrowed: defaultdict[int, Counter[int]] = defaultdict(Counter)
+        self._strayed: Counter[int] = Counter()
+        """By place that is not settled: tokens that a branch of no trial has put there."""
         self.begun = NOBODY if flat.runs_place else 1
         """Number of trials that have begun; the latest one's number."""
         self._home: set[int] = set()
-        """Trials that have all their tokens back while a branch of no trial is still busy."""
+        """Trials that have all their tokens back while a branch of no trial is still busy. One that
+        only listens is not: a trial that was over while it answered would have no end."""
         self.back: list[int] = []
-        """Trials that ended with the latest firing: every token is back, also those of branches of
-        no trial, or it was consumed."""
+        """Trials that ended with the latest firing: every token is back or consumed, also those of
+        branches of no trial that do not only listen."""
 
     def of(self, run: str) -> int:
         """Return the trial of a run; of one that is not known, the latest."""
@@ -86,7 +93,6 @@ class TrialTokens:
                 elif owed:
                     borrowed.append(place)
         if fired.after[own] < fired.before[own]:
-            self._home.clear()
             self.begun += 1
             trials.append(self.begun)
         trial = max(trials, default=NOBODY)
@@ -96,7 +102,9 @@ class TrialTokens:
             for _ in range(weight):
                 touched.add(self._put(trial, place))
         self._home.update(t for t in touched - {NOBODY} if self._has_all(t))
-        if self._has_all(NOBODY):
+        if not self._strayed.total() and not any(
+            n for p, n in self._borrowed[NOBODY].items() if p not in self._listening
+        ):
             self.back = sorted(self._home)
             self._home.clear()
         for done in touched:  # what is kept is as much as is on its way
@@ -113,6 +121,7 @@ class TrialTokens:
         trial = self._runs.pop(known[0]) if known else waiting[0] if waiting else NOBODY
         if trial == NOBODY:
             self._free[place] -= 1
+            self._strayed[place] -= self._strayed[place] > 0
         else:
             waiting.remove(trial)
             self._live[trial] -= place not in self._sinks
@@ -138,6 +147,7 @@ class TrialTokens:
                     return debtor
         elif trial == NOBODY:
             self._free[place] += 1
+            self._strayed[place] += place not in self._settled
         else:
             self._waiting[place].append(trial)
             self._live[trial] += place not in self._sinks

@@ -281,3 +281,61 @@ def test_a_run_that_a_firing_only_reads_stays_the_same_run() -> None:
     assert fire("start") == 2 and tokens.of("put#2") == 2 and tokens.of("change#1") == 1
     assert [fire("changed", "change#1"), fire("ready", "put#2")] == [1, 2]
     assert not tokens.on_its_way(1) and not tokens.on_its_way(2)
+
+
+WAITER = """
+schema = 1
+[task]
+name = "waiter"
+final = "rack == 0 and hand == 1"
+goal_transitions = ["served"]
+runs_place = "rack"
+[primitive_tasks]
+serve = { deadline = 9.0 }
+nod = { deadline = 9.0 }
+[places]
+rack = { kind = "control", tokens = 1 }
+hand = { kind = "resource", tokens = 1 }
+serve = { kind = "action", holds = "hand" }
+listening = { tokens = 1, LISTENS }
+thinking = { LISTENS }
+nod = { kind = "action", LISTENS HOLDS }
+[transitions]
+start = { in = ["rack"], out = ["serve"] }
+served = { in = ["serve:normal"] }
+dropped = { in = ["serve:error"] }
+rings = { in = ["listening"], out = ["thinking"], after = 0.5 }
+nods = { in = ["thinking"], out = ["nod"], priority = 1 }
+nodded = { in = ["nod:normal"], out = ["listening"] }
+tired = { in = ["nod:error"], out = ["listening"] }
+"""
+"""A branch beside the work, whose token is away most of the time."""
+
+
+@pytest.mark.parametrize(
+    ("listens", "holds", "least", "longest"),
+    [
+        ("listen = true", "", 0.7, 0.75),
+        ("listen = true", ", holds = 'hand'", 0.7, 0.75),
+        ("capacity = 1", "", 1.0, 2.0),
+    ],
+    ids=["it only listens", "it needs the hand", "it works"],
+)
+def test_a_branch_beside_the_work_leaves_every_trial_its_end(
+    listens: str, holds: str, least: float, longest: float
+) -> None:
+    """A part that is done while the branch is busy has a time, that of the first moment at which
+    the task could end; one that was dropped is judged. Both were left out once the next part had
+    begun, and with them the trials that took longest."""
+    text = WAITER.replace("LISTENS }\nthinking", "listen = true }\nthinking")
+    task = loads(text.replace("LISTENS", listens).replace("HOLDS", holds), "waiter.toml")
+    serving = [run(0.7), run(0.2), run(0.7, ActionStatus.ERROR), run(0.4), run(0.6)]
+    selector = LearningSelector(Learning(task, "fixed", credit="task"))
+    lines = {"serve": serving, "nod": [run(0.6)]}
+    trials, ends = played(task, 20, lines, selector=selector)
+    assert len(trials) == len(ends) == 20 and all(trial.completed for trial in trials)
+    times = [trial.time for trial in trials if trial.time is not None]
+    assert len(times) == 20 and least < max(times) <= longest
+    judged = [r for r in selector.records if isinstance(r, Credit) and r.primitive_task == "serve"]
+    assert [r.outcome.status is Status.SUCCESS for r in judged].count(False) == 4
+    assert len(judged) == 20

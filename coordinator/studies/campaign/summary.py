@@ -69,6 +69,7 @@ class TrialCounts:
             "wilson": [round(low, 6), round(high, 6)],
             "P_complete": _share(self.completed, self.runs),
             "R_conj": _share(self.all_success, self.runs),
+            "untimed": self.completed - len(self.times),
             "mean": round(float(np.mean(self.times)), 6) if self.times else None,
             "q90": round(float(np.quantile(self.times, 0.9)), 6) if self.times else None,
             "counts": {table: dict(sums) for table, sums in self.counts.items()},

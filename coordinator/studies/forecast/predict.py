@@ -149,8 +149,8 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         **(_by_place(training, request.choices) if repeats else {"routing": {}}),
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
         "asked": asked,
-        "not_back": sum(t.completed and t.time is None for t in training.trials),
-        "notes": _never_entered(training, straight),
+        "not_back": (away := sum(t.completed and t.time is None for t in training.trials)),
+        "notes": [*_never_back(away, len(training.trials)), *_never_entered(training, straight)],
     }
 
 
@@ -199,6 +199,12 @@ def _refuse_unmeasured(training: Training, choices: Choices, asked: list[str]) -
                         f"{primitive}: {action} was never run in {names.places[q]}, so nothing is "
                         "known of it; train with --selector random"
                     )
+
+
+def _never_back(away: int, trials: int) -> list[str]:
+    """Note how many of the trials have no time."""
+    text = "some token was not back when the run ended, so the mean and the quantile lack them"
+    return [f"{away} of {trials} training trials have no time: {text}"] if away else []
 
 
 def _never_entered(training: Training, straight: bool) -> list[str]:
