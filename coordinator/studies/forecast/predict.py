@@ -31,7 +31,7 @@ from petrobot.coordinator.studies.forecast.distributions import (
     dependences,
     siblings,
 )
-from petrobot.coordinator.studies.forecast.history import Codes, Training, Values
+from petrobot.coordinator.studies.forecast.history import CENSORED, Codes, Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
@@ -488,7 +488,7 @@ def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
             own = (
                 (runs.place == q)
                 & (runs.action == names.actions.index(action) + 1)
-                & ~runs.censored
+                & (status != CENSORED)  # a preempted one counts as its arc says
             )
             if own.any():
                 r, whole = (

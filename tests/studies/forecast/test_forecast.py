@@ -309,6 +309,15 @@ def test_other_durations_and_shares_are_forecast_as_they_then_come(
         assert found["figures"][name]["value"] == pytest.approx(truth[name], rel=0.03)
 
 
+def test_a_preempted_run_counts_in_the_product_as_its_arc_says() -> None:
+    """A run that is always preempted when all went well has a reliability, too, not none."""
+    trained = race(2000, np.random.default_rng(1))
+    found = forecast(loads(RACE, "race.toml"), trained)["product"]["factors"]
+    for place in ("look", "hold", "move"):
+        ends = [run.status == "success" for t in trained for run in t.runs if run.place == place]
+        assert found[place] == pytest.approx(np.mean(ends), abs=1e-6) and found[place] > 0.5
+
+
 STEPS = with_transitions("""
 schema = 1
 [task]
