@@ -79,8 +79,9 @@ def judge(
     if task.value is None:
         return Judgement(task, text, cell, None, CheckReport(()))
     own = offers if cell.value is None else cell_of(cell.value)
+    searched = False
     for budget in (None, BUDGET) if search and not task.faults else (None,):
-        judged = may_run(task.value, own, budget)
+        judged, searched = may_run(task.value, own, budget), budget is not None
         report = judged.report
         if cell.value is not None:
             report = _with_code(task.value, cell.value, code, judged)
@@ -91,7 +92,7 @@ def judge(
         for finding, line in zip(report.findings, lines_of(report, text), strict=True)
         if cell.is_new(finding.key, finding.text)
         and (not task.faults or _is_independent(finding, line, task))
-        and (search or not report.ok or not left_to_search(finding))
+        and (searched or not left_to_search(finding))
     ]
     return Judgement(task, text, cell, judged, CheckReport(tuple(found)))
 

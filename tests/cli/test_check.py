@@ -291,6 +291,21 @@ def test_the_states_of_a_file_with_an_error_are_not_searched(
     assert said in "".join(first) and "unknown  " not in "".join(first), first
 
 
+def test_an_error_in_the_code_does_not_bring_warnings_that_only_a_search_decides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The arcs alone suggest conflicts that cannot occur; they sent readers to the wrong file."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "example", "porter"]) == 0
+    monkeypatch.chdir(tmp_path / "porter")
+    code = Path("porter.py").read_text(encoding="utf-8")
+    Path("porter.py").write_text(code.replace("await ctx.sleep(0.2)", "ctx.sleep(0.2)"))
+    capsys.readouterr()
+    assert main(["check", "deliver.toml"]) == 2
+    told = "".join(capsys.readouterr())
+    assert "does nothing without `await`" in told and "warning" not in told, told
+
+
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [
