@@ -291,6 +291,7 @@ def test_the_states_of_a_file_with_an_error_are_not_searched(
     assert said in "".join(first) and "unknown  " not in "".join(first), first
 
 
+@pytest.mark.processes
 def test_an_error_in_the_code_does_not_bring_warnings_that_only_a_search_decides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
