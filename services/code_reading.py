@@ -55,6 +55,7 @@ AWAITED = frozenset(
 """Methods of the context that do nothing unless they are awaited."""
 CONTEXT = ("ctx", "context")
 """Usual names of the context."""
+PORTS = ("ports", "self.ports", "self._ports")
 DEVICE = tuple(f"{name}.device" for name in CONTEXT)
 """The device of an action, as it is usually written."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
@@ -442,6 +443,7 @@ def _states(code: _Code) -> set[str]:
 
 def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
     states = _states(code)
+    called = {node.func for node in code.nodes if isinstance(node, ast.Call)}
     for node in code.nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
@@ -455,6 +457,9 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
         if isinstance(node, ast.Attribute):
             _misspelt(code, node, seen, in_action)
+            # Kept under another name, or of another object: it may raise any event.
+            mine = ast.unparse(node.value) in (*CONTEXT, *PORTS) and node in called
+            seen.any_event |= node.attr == "raise_event" and not mine
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in DEVICE:
             guarded = node.value in code.branched or node in code.tried or code.asks_for_device
             if isinstance(node.ctx, ast.Load) and not guarded:
@@ -616,7 +621,7 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
     """Record a call of a method of the context, or of a driver's ports."""
     owner, name = ast.unparse(function.value), function.attr
     first = code.value(node.args[0]) if node.args else None
-    ports = owner in ("ports", "self.ports", "self._ports")
+    ports = owner in PORTS
     if owner in CONTEXT or ports:
         if name == "call":
             seen.complete = False
@@ -675,7 +680,7 @@ def _remembers(code: _Code, node: ast.Call, name: str, first: Any, seen: _Seen) 
 
 def _writes(code: _Code, node: ast.Call, made: Any, seen: _Seen) -> None:
     """Record what a call may write into the global memory: also through another object than the
-    context, and code that receives the context and is not read."""
+    context. Code that receives the context and is not read may write, or raise, anything."""
     if isinstance(node.func, ast.Attribute) and node.func.attr in ("put", "compare_and_set"):
         name = code.value(node.args[0]) if node.args else None
         seen.any_put |= not isinstance(name, str)
@@ -685,7 +690,9 @@ def _writes(code: _Code, node: ast.Call, made: Any, seen: _Seen) -> None:
     given = [*node.args, *(keyword.value for keyword in node.keywords)]
     if any(ast.unparse(one).rpartition(".")[2] in CONTEXT for one in given):
         own = str(code.names.get("__name__")).partition(".")[0]
-        seen.any_put |= str(getattr(made, "__module__", "")).partition(".")[0] != own
+        unread = str(getattr(made, "__module__", "")).partition(".")[0] != own
+        seen.any_put |= unread
+        seen.any_event |= unread
 
 
 def _lasts(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:

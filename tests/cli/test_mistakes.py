@@ -1586,6 +1586,44 @@ def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) ->
 
 @pytest.mark.processes
 @pytest.mark.parametrize(
+    ("raised", "code"),
+    [
+        ('tell = ctx.raise_event\n    tell("gone_by")', 0),
+        ('getattr(ctx, "raise_event")("gone_by")', 0),
+        ("Teller(ctx).tell()", 0),
+        ('ctx.progress(0.5, note="gone_by")', 2),
+    ],
+)
+def test_an_internal_event_may_be_raised_in_any_way(raised: str, code: int, tmp_path: Path) -> None:
+    """Also by another name of the method, or by an object that keeps the context."""
+    (tmp_path / "gates.py").write_text(
+        "from petrobot import Context, Result, success\n\n\n"
+        "class Teller:\n    def __init__(self, ctx: Context) -> None:\n        self.cell = ctx\n\n"
+        '    def tell(self) -> None:\n        self.cell.raise_event("gone_by")\n\n\n'
+        f"async def look(ctx: Context) -> Result:\n    {raised}\n    return success()\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "services.toml").write_text(
+        'schema = 1\n[nodes]\npc = { host = "127.0.0.1", port = 7499 }\n[actions]\n'
+        'look = { run = "gates:look", node = "pc" }\n',
+        encoding="utf-8",
+    )
+    (tmp_path / "gates.toml").write_text(
+        'schema = 1\n[task]\nname = "gates"\nfinal = "looks == 0"\nfinal_error = "bad > 0"\n'
+        '[errors]\nto = "bad"\n[primitive_tasks]\nlook = { deadline = 5.0 }\n'
+        '[events]\ngone_by = { by = "look" }\n[places]\nbad = {}\n'
+        'looks = { kind = "control", tokens = 2 }\nlook = { kind = "action" }\n[transitions]\n'
+        'start = { in = ["looks", "!look", "!bad"], out = ["look"] }\n'
+        'seen = { in = ["look:preempt=success"], event = "gone_by" }\n'
+        'unseen = { in = ["look:normal"] }\n',
+        encoding="utf-8",
+    )
+    told = "may run" if code == 0 else "events.gone_by.by: look never raises|of look never raises"
+    expect(told, ["check", str(tmp_path / "gates.toml")], code)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
     ("event", "told"),
     [
         ("buton", r"warning .*raises the event 'buton', .*did you mean 'button'"),
