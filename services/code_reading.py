@@ -579,12 +579,15 @@ def _unawaited(code: _Code, node: ast.Call, seen: _Seen) -> None:
 
 
 def _draws_unseeded(made: Any, node: ast.Call) -> bool:
-    """Return whether a call draws from the process's own generator, of `random` or of numpy."""
-    owner = getattr(made, "__self__", None)
-    if getattr(made, "__name__", "") == "default_rng":
+    """Return whether a call draws from a generator of the whole process, of `random` or of numpy,
+    or makes one without a seed."""
+    numpy = sys.modules.get("numpy.random", random)
+    kinds = (random.Random, *(getattr(numpy, name, random.Random)
+                              for name in ("RandomState", "Generator")))  # fmt: skip
+    makers = (*kinds, getattr(numpy, "default_rng", random.Random))
+    if any(made is one for one in makers):
         return not node.args and not node.keywords
-    numpy = sys.modules.get("numpy.random")
-    return isinstance(owner, random.Random | getattr(numpy, "RandomState", random.Random))
+    return isinstance(getattr(made, "__self__", None), kinds)
 
 
 def _sleeps(code: _Code, node: ast.Call, seen: _Seen) -> None:

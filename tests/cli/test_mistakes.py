@@ -518,6 +518,12 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        'if ctx.random("grip").random()',
+        "import random\n    if random.Random().random()",
+        r"arm_bot.py:\d+: random.Random does not use the seed: .*draw from `ctx.random",
+    ),
+    (
+        CODE,
         '"dry_run", "pause")',
         '"pause")',
         r"note    services.toml: --dry-run is refused: the drivers of axis do not obey it",
