@@ -1950,3 +1950,38 @@ def test_runs_beyond_the_capacity_are_refused(
         r"runs: expected at most 20, the capacity of 'parts', found 21; ask for fewer, or raise"
     )
     expect(refusal if code else "status +success", [*RUN, "--runs", runs], code)
+
+
+@pytest.mark.processes
+def test_more_than_one_run_of_a_task_without_a_place_for_its_runs_is_refused(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ran once, and said nothing."""
+    line = next(one for one in sound[TASK].splitlines() if one.startswith("runs_place"))
+    damaged(sound, [(TASK, line, "", "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(r"runs: expected 1, found 3: arm_bot has no place that", [*RUN, "--runs", "3"])
+    expect(r"status +success", [*RUN, "--runs", "1"], 0)
+
+
+@pytest.mark.processes
+def test_a_wrong_call_of_the_device_and_a_stream_without_its_values_are_told(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both failed only when their lines were executed."""
+    scale = (
+        "\n\nclass Scale(Driver):\n    def weigh(self, part: str, times: int = 1) -> float:\n"
+        "        wish = self.ports.stream('zero')\n        return wish[0] * times\n\n\n"
+        "async def weigh(ctx: Context[Scale]) -> Result:\n    ctx.device.weigh('nut')\n"
+        "    ctx.device.weigh(times=2)\n    return success()\n"
+    )
+    cell = '\n[streams.zero]\nto = "scale"\nperiod = 0.1\n[devices.scale]\nnode = "pc"\ndriver = "arm_bot:Scale"\n'
+    files = {**sound, CODE: sound[CODE] + scale, CELL: sound[CELL] + cell}
+    grip = 'run = "arm_bot:grip", device = "axis"'
+    damaged(files, [(CELL, grip, 'run = "arm_bot:weigh", device = "scale"', "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, words = said(*CHECK)
+    flat = " ".join(words.split())
+    assert code == 2 and "`wish` is the receiving end of a stream" in flat, words
+    assert "`ctx.device.weigh(times=2)`: missing a required argument: 'part'" in flat, words
+    assert "weigh('nut')" not in flat, words
