@@ -1975,7 +1975,8 @@ def test_a_wrong_call_of_the_device_and_a_stream_without_its_values_are_told(
         "async def weigh(ctx: Context[Scale]) -> Result:\n    ctx.device.weigh('nut')\n"
         "    ctx.device.weigh(times=2)\n    return success()\n"
     )
-    cell = '\n[streams.zero]\nto = "scale"\nperiod = 0.1\n[devices.scale]\nnode = "pc"\ndriver = "arm_bot:Scale"\n'
+    cell = '\n[streams]\nzero = { to = "scale", period = 0.1 }\n'
+    cell += '[devices.scale]\nnode = "pc"\ndriver = "arm_bot:Scale"\n'
     files = {**sound, CODE: sound[CODE] + scale, CELL: sound[CELL] + cell}
     grip = 'run = "arm_bot:grip", device = "axis"'
     damaged(files, [(CELL, grip, 'run = "arm_bot:weigh", device = "scale"', "")], tmp_path)
