@@ -55,6 +55,7 @@ AWAITED = frozenset(
 """Methods of the context that do nothing unless they are awaited."""
 CONTEXT = ("ctx", "context")
 """Usual names of the context."""
+PORTS = ("ports", "self.ports", "self._ports")
 DEVICE = tuple(f"{name}.device" for name in CONTEXT)
 """The device of an action, as it is usually written."""
 REMEMBERS = frozenset(("get", "get_versioned", "put", "compare_and_set"))
@@ -427,13 +428,18 @@ def _commands(node: ast.AST | None) -> bool:
     return isinstance(node, ast.Call) and ast.unparse(node.func) in orders
 
 
-def _states(code: _Code) -> set[str]:
-    """Return the variables that hold nothing but states which `ctx.command` returned."""
+def _receives(node: ast.AST | None) -> bool:
+    """Whether it is a `self.ports.stream(...)`."""
+    return isinstance(node, ast.Call) and ast.unparse(node.func) in {f"{p}.stream" for p in PORTS}
+
+
+def _holding(code: _Code, gives: Callable[[ast.AST | None], bool]) -> set[str]:
+    """Return the variables that hold nothing but results of such calls."""
     stored = [n for n in code.nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)]
     given = [
         target.id
         for node in code.nodes
-        if isinstance(node, ast.Assign) and _commands(node.value)
+        if isinstance(node, ast.Assign) and gives(node.value)
         for target in node.targets
         if isinstance(target, ast.Name)
     ]
@@ -441,7 +447,8 @@ def _states(code: _Code) -> set[str]:
 
 
 def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
-    states = _states(code)
+    states, streams = _holding(code, _commands), _holding(code, _receives)
+    called = {node.func for node in code.nodes if isinstance(node, ast.Call)}
     for node in code.nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             seen.words.add(node.value)
@@ -455,6 +462,9 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
                 seen.device = (code.file, node.lineno, f"{owner}.{node.attr}")
         if isinstance(node, ast.Attribute):
             _misspelt(code, node, seen, in_action)
+            # Kept under another name, or of another object: it may raise any event.
+            mine = ast.unparse(node.value) in (*CONTEXT, *PORTS) and node in called
+            seen.any_event |= node.attr == "raise_event" and not mine
         if isinstance(node, ast.Attribute) and ast.unparse(node.value) in DEVICE:
             guarded = node.value in code.branched or node in code.tried or code.asks_for_device
             if isinstance(node.ctx, ast.Load) and not guarded:
@@ -465,6 +475,12 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
         if isinstance(raised, ast.Call) and any(code.value(raised.func) is one for one in MADE):
             text = f"`raise {ast.unparse(raised)}`: a result is returned; write `return`"
             seen.faults.append((code.file, raised.lineno, text))
+        if isinstance(node, ast.Subscript) and (
+            _receives(node.value) or ast.unparse(node.value) in streams
+        ):
+            text = "is the receiving end of a stream; its numbers, or None, are in"
+            name = ast.unparse(node.value)
+            seen.faults.append((code.file, node.lineno, f"`{name}` {text} `{name}.values`"))
         if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
             name = str(node.slice.value)
             state = ast.unparse(node.value) in {f"{one}.state" for one in DEVICE} | states
@@ -574,12 +590,17 @@ def _unawaited(code: _Code, node: ast.Call, seen: _Seen) -> None:
 
 
 def _draws_unseeded(made: Any, node: ast.Call) -> bool:
-    """Return whether a call draws from the process's own generator, of `random` or of numpy."""
-    owner = getattr(made, "__self__", None)
-    if getattr(made, "__name__", "") == "default_rng":
+    """Return whether a call draws from a generator of the whole process, of `random` or of numpy,
+    or makes one without a seed."""
+    numpy = sys.modules.get("numpy.random", random)
+    kinds = (
+        random.Random,
+        *(getattr(numpy, name, random.Random) for name in ("RandomState", "Generator")),
+    )
+    makers = (*kinds, getattr(numpy, "default_rng", random.Random))
+    if any(made is one for one in makers):
         return not node.args and not node.keywords
-    numpy = sys.modules.get("numpy.random")
-    return isinstance(owner, random.Random | getattr(numpy, "RandomState", random.Random))
+    return isinstance(getattr(made, "__self__", None), kinds)
 
 
 def _sleeps(code: _Code, node: ast.Call, seen: _Seen) -> None:
@@ -616,14 +637,14 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
     """Record a call of a method of the context, or of a driver's ports."""
     owner, name = ast.unparse(function.value), function.attr
     first = code.value(node.args[0]) if node.args else None
-    ports = owner in ("ports", "self.ports", "self._ports")
+    ports = owner in PORTS
     if owner in CONTEXT or ports:
         if name == "call":
             seen.complete = False
         if name in AWAITED and not ports and node not in code.awaited:
             _unawaited(code, node, seen)
         if not ports:
-            _binds(code, node, name, seen)
+            _binds(code, node, vars(actions.Context).get(name), seen.faults)
         if name in REMEMBERS and not ports:
             seen.memory = seen.memory or (code.file, node.lineno)
             _remembers(code, node, name, first, seen)
@@ -642,9 +663,8 @@ def _method(code: _Code, node: ast.Call, function: ast.Attribute, seen: _Seen) -
                 seen.calls.setdefault(first, (code.file, node.lineno))
 
 
-def _binds(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:
-    """Record a call of a method of the context with wrong arguments."""
-    method = vars(actions.Context).get(name)
+def _binds(code: _Code, node: ast.Call, method: object, faults: list[tuple[str, int, str]]) -> None:
+    """Record a call of a method of the context, or of its device, with wrong arguments."""
     starred = any(isinstance(one, ast.Starred) for one in node.args)
     if not inspect.isfunction(method) or starred or any(k.arg is None for k in node.keywords):
         return
@@ -653,9 +673,14 @@ def _binds(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:
             None, *node.args, **{str(k.arg): None for k in node.keywords}
         )
     except TypeError as fault:
-        takes = str(inspect.signature(method)).partition(" ->")[0].replace("(self, ", "(")
+        takes = (
+            str(inspect.signature(method))
+            .partition(" ->")[0]
+            .replace("(self, ", "(")
+            .replace("(self)", "()")
+        )
         text = f"`{ast.unparse(node)}`: {fault}; it is `{ast.unparse(node.func)}{takes}`"
-        seen.faults.append((code.file, node.lineno, text))
+        faults.append((code.file, node.lineno, text))
 
 
 def _set_points(code: _Code, node: ast.Call, seen: _Seen) -> None:
@@ -675,7 +700,7 @@ def _remembers(code: _Code, node: ast.Call, name: str, first: Any, seen: _Seen) 
 
 def _writes(code: _Code, node: ast.Call, made: Any, seen: _Seen) -> None:
     """Record what a call may write into the global memory: also through another object than the
-    context, and code that receives the context and is not read."""
+    context. Code that receives the context and is not read may write, or raise, anything."""
     if isinstance(node.func, ast.Attribute) and node.func.attr in ("put", "compare_and_set"):
         name = code.value(node.args[0]) if node.args else None
         seen.any_put |= not isinstance(name, str)
@@ -685,7 +710,9 @@ def _writes(code: _Code, node: ast.Call, made: Any, seen: _Seen) -> None:
     given = [*node.args, *(keyword.value for keyword in node.keywords)]
     if any(ast.unparse(one).rpartition(".")[2] in CONTEXT for one in given):
         own = str(code.names.get("__name__")).partition(".")[0]
-        seen.any_put |= str(getattr(made, "__module__", "")).partition(".")[0] != own
+        unread = str(getattr(made, "__module__", "")).partition(".")[0] != own
+        seen.any_put |= unread
+        seen.any_event |= unread
 
 
 def _lasts(code: _Code, node: ast.Call, name: str, seen: _Seen) -> None:
@@ -787,6 +814,7 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
     own = _code(thing) if inspect.isfunction(thing) else None
     if own is not None:
         _ends(own, thing.__name__, seen)
+        _asks_device(own, _driver_of(hints.get(first.name) if first else None), seen)
     if alone:
         source = inspect.unwrap(thing).__code__
         text = f"{thing.__name__} takes no context; its first parameter is `ctx`"
@@ -801,6 +829,19 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         "wants": _wanted(hints.get(first.name) if first else None),
         **_plain(seen),
     }
+
+
+def _asks_device(own: _Code, driver: type[Driver] | None, seen: _Seen) -> None:
+    """Record calls of methods of an action's device with wrong arguments. The device of a cyclic
+    driver is its remote."""
+    if driver is None or driver.period is not None:
+        return
+    for node in own.nodes:
+        match node:
+            case ast.Call(func=ast.Attribute(value=owner, attr=name)):
+                if ast.unparse(owner) in DEVICE:
+                    method = inspect.getattr_static(driver, name, None)
+                    _binds(own, node, method, seen.doubtful)
 
 
 def _ends(own: _Code, name: str, seen: _Seen) -> None:
@@ -834,13 +875,18 @@ def _falls_off(last: ast.stmt) -> bool:
     return isinstance(last, ast.Expr | ast.Assign | ast.AugAssign | ast.AnnAssign | ast.Pass)
 
 
-def _wanted(hint: Any) -> list[str]:
-    """Return the class of the driver that an action's `Context[...]` names, and its path; empty if
-    it names none."""
+def _driver_of(hint: Any) -> type[Driver] | None:
+    """Return the class of the driver that an action's `Context[...]` names; None if it names
+    none."""
     found = next(iter(get_args(hint)), None)
-    if not inspect.isclass(found) or not issubclass(found, Driver) or found is Driver:
-        return []
-    return [found.__name__, f"{found.__module__}:{found.__qualname__}"]
+    named = inspect.isclass(found) and issubclass(found, Driver) and found is not Driver
+    return found if named else None
+
+
+def _wanted(hint: Any) -> list[str]:
+    """Return the name of that class, and its path; empty if there is none."""
+    found = _driver_of(hint)
+    return [found.__name__, f"{found.__module__}:{found.__qualname__}"] if found else []
 
 
 def _driver(thing: Any, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

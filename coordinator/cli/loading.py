@@ -228,14 +228,18 @@ def find_cell(given: Path | None, name: str, task: Task | None) -> Path | None:
     if given is not None:
         return given
     written = task_path(name)
+    folders = (written.parent, written.resolve().parent)  # the task may be a symbolic link
     if task is None or not task.services:
         if written.parent == SHIPPED:
             return services_path(None)
-        folder = written.parent
-        above = Path(os.path.normpath(folder / ".." / "services.toml"))
-        near = (folder / "services.toml", above, Path("services.toml"))
-        return next((path for path in near if path.is_file()), None)
-    path = written.parent / task.services
+        near = [
+            os.path.normpath(folder / up / "services.toml")
+            for folder in folders
+            for up in (".", "..")
+        ]
+        return next((path for path in map(Path, (*near, "services.toml")) if path.is_file()), None)
+    named = [folder / task.services for folder in folders]
+    path = next((path for path in named if path.is_file()), named[0])
     if not path.is_file():
         what = f"{path} is not a file" if path.exists() else f"no such file: {path}"
         remedy = f"name one relative to {written.name}, drop the key, or give --services FILE"

@@ -11,10 +11,12 @@ import re
 from pathlib import Path
 
 from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import SHIPPED_CELL
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 EXAMPLE = "petrobot new robot carrier"
 EXAMPLES = Path(__file__).parents[2] / "examples"
+NAMED_CELL = '"../../services.toml"'
 """The robots of the pages, each a folder of its own."""
 
 ACTION = '''\
@@ -335,9 +337,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _robot(name: str, folder: Path) -> tuple[dict[Path, str], str]:
-    if importlib.util.find_spec(name) is not None:
-        text = f"a Python module named {name!r} is there already and would hide the robot's own"
-        raise CommandError(2, f"{text}; choose another name")
+    _refuse_hidden(name, folder / name / f"{name}.py")
     project = folder / name
     code = _filled(DRIVER + ROBOT_ACTIONS, name, device="slide")
     code = code.replace("The device slide: say here what it is.", f"The robot {name}.")
@@ -399,7 +399,12 @@ def _example(name: str, folder: Path) -> tuple[dict[Path, str], str]:
     if name not in _examples():
         raise CommandError(2, f"no example {name!r}; there are: {', '.join(_examples())}")
     paths = sorted(path for path in (EXAMPLES / name).iterdir() if path.is_file())
-    files = {folder / name / path.name: path.read_text(encoding="utf-8") for path in paths}
+    # A task that names the cell of the catching task finds it from its new folder, too.
+    there = f'"{SHIPPED_CELL}"'
+    files = {
+        folder / name / path.name: path.read_text(encoding="utf-8").replace(NAMED_CELL, there)
+        for path in paths
+    }
     tasks = [path.name for path in paths if path.suffix == ".toml" and path.stem != "services"]
     return files, f"next: cd {folder / name}; petrobot check {tasks[0]}"
 
@@ -407,8 +412,28 @@ def _example(name: str, folder: Path) -> tuple[dict[Path, str], str]:
 def _python(name: str, folder: Path) -> tuple[str, tuple[Path, Path]]:
     """The import name of a new module in a package `folder`, its file and that of its test."""
     if not folder.name:
+        _refuse_hidden(name, Path(f"{name}.py"))
         return name, (Path(f"{name}.py"), Path(f"test_{name}.py"))
+    if not folder.name.isidentifier() or keyword.iskeyword(folder.name):
+        text = f"--folder {folder}: {folder.name!r} cannot be the name of a package of Python"
+        raise CommandError(2, f"{text}; use letters, digits and _")
+    _refuse_hidden(folder.name, folder)
     return f"{folder.name}.{name}", (folder / f"{name}.py", folder.parent / f"test_{name}.py")
+
+
+def _refuse_hidden(name: str, path: Path) -> None:
+    """Refuse a module or package `path` if Python already has another one of this name."""
+    spec = importlib.util.find_spec(name)
+    if spec is None:
+        return
+    known = [
+        Path(one).resolve()
+        for one in (spec.origin, *(spec.submodule_search_locations or ()))
+        if one
+    ]
+    if path.resolve() not in known:
+        text = f"a Python module named {name!r} is there already and would hide {path}"
+        raise CommandError(2, f"{text}; choose another name")
 
 
 def _class(name: str) -> str:

@@ -290,11 +290,13 @@ def scene_of_task(
     arcs = tuple(_joined_arcs(sheet))
     drawn: dict[str, Place | Transition] = {**sheet.places, **sheet.transitions}
     wanted = {n: _given(e.x, e.y) if n not in sheet.border else None for n, e in drawn.items()}
+    # By the initial tokens: whatever the marking, a net is laid out alike, also in a film.
+    tokens = sheet_of(task, inside, error_branches, None).tokens
     layout = lay_out(
         wanted,
         [(a.source, a.target) for a in arcs],
-        [n for n in sheet.places if sheet.tokens.get(n)],
-        {n for n, p in sheet.places.items() if p.kind is Kind.RESOURCE and sheet.tokens.get(n)},
+        [n for n in sheet.places if tokens.get(n)],
+        {n for n, p in sheet.places.items() if p.kind is Kind.RESOURCE and tokens.get(n)},
     )
     at = layout.at
     nodes = {n: _place_node(sheet, p, at[n]) for n, p in sheet.places.items()}

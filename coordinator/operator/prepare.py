@@ -145,8 +145,14 @@ def prepare(
 
 
 def _refuse_too_many(runs: int | None, task: Task) -> None:
-    """Raise RequestError if the place of the runs cannot hold that number of tokens."""
+    """Raise RequestError if the place of the runs cannot hold that number of tokens, or the task
+    has no such place."""
     place = task.places.get(task.runs_place)
+    if place is None and (runs or 1) > 1:
+        raise RequestError(
+            f"runs: expected 1, found {runs}: {task.name} has no place that holds its runs; ask "
+            "for one run, or name that place in task.runs_place of the task file"
+        )
     most = None if place is None else place.capacity
     if runs is not None and most is not None and runs > most:
         raise RequestError(

@@ -9,7 +9,7 @@ class Camera(Driver):
 
     noise: float = key(1.0, "pixels, standard deviation in each direction")
 
-    def picture(self) -> tuple[float, float]:
+    def locate(self) -> tuple[float, float]:
         x, y = self.ports.random("pictures").normal(0.0, self.noise, 2)
         return float(x), float(y)
 
@@ -17,7 +17,7 @@ class Camera(Driver):
 async def _mean(ctx: Context[Camera], n: int, accuracy: float) -> Result:
     """Locate the point by the mean of n pictures; SUCCESS within `accuracy` (pixels)."""
     await ctx.sleep(0.02 * n)
-    pictures = [ctx.device.picture() for _ in range(n)]
+    pictures = [ctx.device.locate() for _ in range(n)]
     x, y = (sum(axis) / n for axis in zip(*pictures, strict=True))
     error = float((x * x + y * y) ** 0.5)
     if error > accuracy:

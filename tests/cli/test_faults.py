@@ -178,6 +178,13 @@ def test_the_location_file_in_use_is_named(petrobot: Petrobot) -> None:
         code, out, _ = petrobot("check", "lab/tasks/work.toml")
         assert code == 2 and f"add [actions.work] to {path}, or drop it here" in out, number
         path.unlink()
+    Path("linked.toml").symlink_to(folder / "work.toml")
+    Path("lab/services.toml").write_text(wrong, encoding="utf-8")
+    here = Path("services.toml").rename("kept.toml")
+    code, out, _ = petrobot("check", "linked.toml")
+    assert code == 2 and "add [actions.work] to" in out and "lab/services.toml" in out, "of a link"
+    here.rename("services.toml")
+    Path("lab/services.toml").unlink()
     assert petrobot("check", "lab/tasks/work.toml")[0] == 0, "the one here"
     Path("services.toml").unlink()
     code, out, _ = petrobot("check", "lab/tasks/work.toml")

@@ -518,6 +518,12 @@ IN_THE_CODE: list[Mistake] = [
     ),
     (
         CODE,
+        'if ctx.random("grip").random()',
+        "import random\n    if random.Random().random()",
+        r"arm_bot.py:\d+: random.Random does not use the seed: .*draw from `ctx.random",
+    ),
+    (
+        CODE,
         '"dry_run", "pause")',
         '"pause")',
         r"note    services.toml: --dry-run is refused: the drivers of axis do not obey it",
@@ -1586,6 +1592,44 @@ def test_an_event_does_not_become_internal_by_its_declaration(tmp_path: Path) ->
 
 @pytest.mark.processes
 @pytest.mark.parametrize(
+    ("raised", "code"),
+    [
+        ('tell = ctx.raise_event\n    tell("gone_by")', 0),
+        ('getattr(ctx, "raise_event")("gone_by")', 0),
+        ("Teller(ctx).tell()", 0),
+        ('ctx.progress(0.5, note="gone_by")', 2),
+    ],
+)
+def test_an_internal_event_may_be_raised_in_any_way(raised: str, code: int, tmp_path: Path) -> None:
+    """Also by another name of the method, or by an object that keeps the context."""
+    (tmp_path / "gates.py").write_text(
+        "from petrobot import Context, Result, success\n\n\n"
+        "class Teller:\n    def __init__(self, ctx: Context) -> None:\n        self.cell = ctx\n\n"
+        '    def tell(self) -> None:\n        self.cell.raise_event("gone_by")\n\n\n'
+        f"async def look(ctx: Context) -> Result:\n    {raised}\n    return success()\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "services.toml").write_text(
+        'schema = 1\n[nodes]\npc = { host = "127.0.0.1", port = 7499 }\n[actions]\n'
+        'look = { run = "gates:look", node = "pc" }\n',
+        encoding="utf-8",
+    )
+    (tmp_path / "gates.toml").write_text(
+        'schema = 1\n[task]\nname = "gates"\nfinal = "looks == 0"\nfinal_error = "bad > 0"\n'
+        '[errors]\nto = "bad"\n[primitive_tasks]\nlook = { deadline = 5.0 }\n'
+        '[events]\ngone_by = { by = "look" }\n[places]\nbad = {}\n'
+        'looks = { kind = "control", tokens = 2 }\nlook = { kind = "action" }\n[transitions]\n'
+        'start = { in = ["looks", "!look", "!bad"], out = ["look"] }\n'
+        'seen = { in = ["look:preempt=success"], event = "gone_by" }\n'
+        'unseen = { in = ["look:normal"] }\n',
+        encoding="utf-8",
+    )
+    told = "may run" if code == 0 else "events.gone_by.by: look never raises|of look never raises"
+    expect(told, ["check", str(tmp_path / "gates.toml")], code)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
     ("event", "told"),
     [
         ("buton", r"warning .*raises the event 'buton', .*did you mean 'button'"),
@@ -1906,3 +1950,39 @@ def test_runs_beyond_the_capacity_are_refused(
         r"runs: expected at most 20, the capacity of 'parts', found 21; ask for fewer, or raise"
     )
     expect(refusal if code else "status +success", [*RUN, "--runs", runs], code)
+
+
+@pytest.mark.processes
+def test_more_than_one_run_of_a_task_without_a_place_for_its_runs_is_refused(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ran once, and said nothing."""
+    line = next(one for one in sound[TASK].splitlines() if one.startswith("runs_place"))
+    damaged(sound, [(TASK, line, "", "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    expect(r"runs: expected 1, found 3: arm_bot has no place that", [*RUN, "--runs", "3"])
+    expect(r"status +success", [*RUN, "--runs", "1"], 0)
+
+
+@pytest.mark.processes
+def test_a_wrong_call_of_the_device_and_a_stream_without_its_values_are_told(
+    sound: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both failed only when their lines were executed."""
+    scale = (
+        "\n\nclass Scale(Driver):\n    def weigh(self, part: str, times: int = 1) -> float:\n"
+        "        wish = self.ports.stream('zero')\n        return wish[0] * times\n\n\n"
+        "async def weigh(ctx: Context[Scale]) -> Result:\n    ctx.device.weigh('nut')\n"
+        "    ctx.device.weigh(times=2)\n    return success()\n"
+    )
+    cell = '\n[streams]\nzero = { to = "scale", period = 0.1 }\n'
+    cell += '[devices.scale]\nnode = "pc"\ndriver = "arm_bot:Scale"\n'
+    files = {**sound, CODE: sound[CODE] + scale, CELL: sound[CELL] + cell}
+    grip = 'run = "arm_bot:grip", device = "axis"'
+    damaged(files, [(CELL, grip, 'run = "arm_bot:weigh", device = "scale"', "")], tmp_path)
+    monkeypatch.chdir(tmp_path)
+    code, words = said(*CHECK)
+    flat = " ".join(words.split())
+    assert code == 2 and "`wish` is the receiving end of a stream" in flat, words
+    assert "`ctx.device.weigh(times=2)`: missing a required argument: 'part'" in flat, words
+    assert "weigh('nut')" not in flat, words

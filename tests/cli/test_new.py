@@ -93,6 +93,10 @@ def test_a_new_driver_can_be_placed(
     [
         (["robot", "json"], "a Python module named 'json' is there already"),
         (["robot", "Arm"], "use small letters, digits and _, a letter first"),
+        (["driver", "select"], "a Python module named 'select' is there already"),
+        (["action", "numpy"], "a Python module named 'numpy' is there already"),
+        (["action", "grip", "--folder", "email"], "a Python module named 'email' is there already"),
+        (["action", "grip", "--folder", "my-lab"], "'my-lab' cannot be the name of a package"),
         (["driver", "class"], "'class' is a keyword of Python"),
         (["robot", "kept"], "exists already; choose another name or --folder"),
     ],
@@ -118,10 +122,18 @@ def test_an_example_is_copied_whole(name: str, tmp_path: Path) -> None:
     """Who has only the wheel and the pages can follow them."""
     assert main(["new", "example", name, "--folder", str(tmp_path)]) == 0
     theirs = sorted(path for path in (ROOT / "examples" / name).iterdir() if path.is_file())
-    assert [(p.name, p.read_bytes()) for p in theirs] == [
+    shipped = str(ROOT / "services.toml").encode()
+    assert [(p.name, p.read_bytes().replace(b"../../services.toml", shipped)) for p in theirs] == [
         (p.name, p.read_bytes()) for p in sorted((tmp_path / name).iterdir())
     ]
     assert main(["new", "example", name, "--folder", str(tmp_path)]) == 2, "nothing is overwritten"
+
+
+@pytest.mark.processes
+def test_the_copied_figure_of_the_paper_names_the_cell_that_it_runs_in(tmp_path: Path) -> None:
+    assert main(["new", "example", "paper", "--folder", str(tmp_path)]) == 0
+    ran = python(tmp_path, "petrobot.coordinator", "check", "paper/figure1.toml")
+    assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
 def test_an_example_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,6 +47,24 @@ def test_the_film_shows_laboratory_and_net(
     assert np.abs(images[1][half:] - images[0][half:]).max() > 50
 
 
+def test_a_net_without_positions_is_laid_out_alike_for_each_marking(tmp_path: Path) -> None:
+    """Images of several sizes are no film. Here no marked place is left at the end."""
+    file = tmp_path / "lift.toml"
+    file.write_text(
+        'schema = 1\n[task]\nname = "lift"\nfinal = "jobs == 0"\nfinal_error = "bad > 0"\n'
+        '[errors]\nto = "bad"\n[primitive_tasks]\nmove = { deadline = 5.0 }\n[places]\n'
+        'jobs = { kind = "control", tokens = 2 }\nbad = {}\n'
+        'up = { kind = "action", task = "move" }\ndown = { kind = "action", task = "move" }\n'
+        '[transitions]\nstart = { in = ["jobs", "!up", "!down", "!bad"], out = ["up"] }\n'
+        'top = { in = ["up:normal"], out = ["down"] }\nend = { in = ["down:normal"] }\n',
+        encoding="utf-8",
+    )
+    task = load(file)
+    markings = [tuple(int(p == k) for p in range(len(task.net.places))) for k in range(4)]
+    drawn = [draw(task, marking=marking) for marking in [*markings, (0,) * len(task.net.places)]]
+    assert len({re.findall(r'viewBox="([^"]+)"', svg)[0] for svg in drawn}) == 1
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [
