@@ -7,6 +7,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +130,8 @@ def _campaign(folder: Path, options: argparse.Namespace) -> tuple[str, dict[str,
 
     plan, task, rows = opened(folder)
     report = CampaignReport(plan, task, rows, _plots(folder))
+    if report.without:
+        print(f"no probabilities of choices: {report.without}", file=sys.stderr)
     more: list[str] = []
     if options.against is not None:
         found = compared(folder, options.against, options.rho_of)
@@ -153,10 +156,13 @@ def _names(one: Path, other: Path) -> tuple[str, str]:
 def opened(folder: Path) -> tuple[CampaignPlan, Task, list[TrialRow]]:
     """Return plan, task and rows of a campaign. Raises CampaignError, and CommandError if it has no
     rows."""
-    from petrobot.coordinator.studies.campaign.plan import read_manifest
+    from petrobot.coordinator.studies.campaign.plan import TASK_COPY, read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 
     plan = read_manifest(folder)
+    if (copy := folder / TASK_COPY).is_file():  # the task file may have changed since
+        digests = {key: said for key, said in plan.digests.items() if key != "task"}
+        plan = replace(plan, task=str(copy), digests=digests)
     rows = list(read_table(folder / TABLE))
     if not rows:
         raise CommandError(2, f"{folder}: the table holds no run yet")

@@ -216,6 +216,24 @@ def test_a_module_whose_import_never_ends_is_imported_once(tmp_path: Path) -> No
 
 
 @pytest.mark.processes
+def test_two_cells_of_one_process_may_have_modules_of_the_same_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a page that serves the tasks of two robots: each is judged by its own code."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("left", "right", "left"):
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        (folder / "robot.py").write_text(f"async def {name}(ctx): ...\n")
+        text = 'schema = 1\nnodes.pc = { host = "127.0.0.1", port = 7561 }\n'
+        (folder / "services.toml").write_text(
+            f'{text}actions.go = {{ run = "robot:{name}", node = "pc" }}\n'
+        )
+        code = read_code(load(folder / "services.toml"), seconds=5.0)
+        assert "import" not in code[f"robot:{name}"], code
+
+
+@pytest.mark.processes
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 async def test_an_import_that_never_ends_ends_with_its_check(
     tmp_path: Path, how: signal.Signals

@@ -609,7 +609,7 @@ def test_analyse_reports_measures_of_the_user(capsys: pytest.CaptureFixture[str]
 @pytest.mark.processes
 def test_the_skeletons_of_new_work(tmp_path: Path) -> None:
     """The skeletons' own tests pass as they are written."""
-    for what, name in (("action", "wave"), ("task", "greet")):
+    for what, name in (("action", "beckon"), ("task", "greet")):
         assert petrobot("new", what, name, cwd=tmp_path).returncode == 0
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
     command = [

@@ -15,7 +15,7 @@ from petrobot.coordinator.learning.objective import Figures, break_even, pareto
 from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.campaign.observed import regime_of
-from petrobot.coordinator.studies.campaign.plan import CampaignPlan
+from petrobot.coordinator.studies.campaign.plan import CampaignError, CampaignPlan
 from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import Trial
@@ -150,8 +150,13 @@ class CampaignReport:
         self.plan, self.task, self.rows = plan, task, rows
         self.summary = Summary.of(task, rows, options=plan.options)
         self.trials = objective_curves(task, rows)
-        learned_curves(plan, rows, self.trials)
+        self.without = ""
+        """Why the probabilities of the choices are missing, if they are."""
         word = "choice probability" if plan.batch else "share of choices"
+        try:
+            learned_curves(plan, rows, self.trials)
+        except CampaignError as fault:
+            word, self.without = "share of choices", str(fault)
         self.pictures = trial_pictures(self.trials, word) | action_pictures(
             task, self.summary.estimates
         )

@@ -391,14 +391,22 @@ def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
 def _find_modules_in(folder: Path) -> None:
     """Let every process that reads a location file import the modules beside it.
 
-    The folder comes last, so nothing in it hides an installed module. A folder that belongs to a
-    package is left out: its modules already have a name.
+    The folder comes last, so nothing in it hides an installed module, but before those of other
+    location files that this process has read: they may have modules of the same name. A folder that
+    belongs to a package is left out: its modules already have a name.
     """
     found = folder.resolve()
     package = (found / "__init__.py").exists() or found == (SHIPPED / CELL).resolve().parent
-    if not package and str(found) not in sys.path:
-        sys.path.append(str(found))
-        importlib.invalidate_caches()
+    own = str(found)
+    if package or (own in sys.path and own not in _cells):
+        return
+    _cells[:] = [own, *(cell for cell in _cells if cell != own)]
+    sys.path[:] = [path for path in sys.path if path not in _cells] + _cells
+    importlib.invalidate_caches()
+
+
+_cells: list[str] = []
+"""Folders of location files that this process has put on the path, the latest first."""
 
 
 def _import_fault(path: str) -> str:
