@@ -265,6 +265,19 @@ def read_journal(path: Path) -> Journal:
     return Journal(path, records[0].data, tuple(records[1:]), len(raw) - offset, offset)
 
 
+def read_header(path: Path) -> Mapping[str, Any]:
+    """Return the header of a journal without reading the rest. Raises JournalError, OSError."""
+    start = len(MAGIC) + PREFIX.size
+    with path.open("rb") as file:
+        raw = file.read(start)
+        if raw.startswith(MAGIC) and len(raw) == start:
+            raw += file.read(PREFIX.unpack_from(raw, len(MAGIC))[0])
+    payload = _payload(raw, len(MAGIC)) if raw.startswith(MAGIC) else None
+    if payload is None:
+        raise JournalError(f"{path}: has no whole header; the run had not begun")
+    return _record(path, payload, 0).data
+
+
 def _foreign(raw: bytes) -> str:
     """Return what a file is that does not begin like a journal of this format."""
     known = _FAMILY.match(raw)
