@@ -30,6 +30,7 @@ from typing import Any
 
 import msgpack
 
+from petrobot.coordinator.run.folder import date_back
 from petrobot.services.host.whole_file import make_folder, sync_folder
 
 FORMAT = 1
@@ -97,6 +98,7 @@ class JournalWriter:
                 text = f"{path}: {fault.strerror}; give --journal a folder that can be written"
                 raise JournalError(text) from fault
             self._take(path)
+            date_back(path.parent.parent)
             self._buffer += MAGIC
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
