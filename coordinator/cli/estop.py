@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,7 @@ from petrobot.coordinator.cli.loading import (
     add_json_argument,
     add_services_argument,
     load_directory,
+    services_path,
     tell_of_demo,
     write_json,
 )
@@ -23,6 +25,7 @@ from petrobot.coordinator.cli.options import add_runs_argument
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.emergency_stop import Stopped
     from petrobot.coordinator.operator.run_address import RunAddress
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot estop"
 HARDWARE = "press the hardware's emergency stop"
@@ -60,13 +63,13 @@ def run(options: argparse.Namespace) -> int:
     path = options.services or (
         Path(address.services) if address is not None and address.services else None
     )
-    directory = load_directory(path)
+    directory, begun = _cells(options, path, address)
     # The devices of the demo are stopped, too: who presses the button must not wait for this.
     tell_of_demo(path, directory, f", or {HARDWARE}")
     verb = CLEAR if options.clear else STOP
-    begun = time.perf_counter()
-    answers = asyncio.run(order_all(directory, verb, bus=options.bus))
-    took = time.perf_counter() - begun
+    ordered = time.perf_counter()
+    answers = asyncio.run(order_all(directory, verb, bus=options.bus, begun=begun))
+    took = time.perf_counter() - ordered
     coordinator = (
         asyncio.run(_tell(address, options.journal))
         if address is not None and not options.clear
@@ -88,6 +91,44 @@ def _address(options: argparse.Namespace) -> RunAddress | None:
         if options.run is not None:
             raise CommandError(2, str(fault)) from fault
         return None
+
+
+def _cells(
+    options: argparse.Namespace, path: Path | None, address: RunAddress | None
+) -> tuple[Directory, Directory | None]:
+    """Return the cell of services.toml, and what it was when the active run began, if it was edited
+    since (to clear a stop: when the newest run began).
+
+    A file that was edited into one that cannot be read, or removed, keeps no stop from the nodes:
+    the newest run's is taken."""
+    begun = _begun(address.run if address is not None else options.run or "last", options.journal)
+    if path is None and begun is not None and not Path("services.toml").exists():
+        path = begun.source if begun.source.parent == Path.cwd() else None
+    own = begun is not None and begun.source.resolve() == services_path(path).resolve()
+    try:
+        directory = load_directory(path)
+    except CommandError as fault:
+        if begun is None or not own:
+            raise
+        print(f"{fault}\nmeant is the cell as the newest run here began with it", file=sys.stderr)
+        return begun, None
+    edited = begun is not None and own and begun.hash != directory.hash
+    return directory, begun if edited and (address is not None or options.clear) else None
+
+
+def _begun(run: str, folder: Path) -> Directory | None:
+    """Return the cell that a run began with; None without such a run in real time."""
+    from petrobot.coordinator.run.folder import NoRunError, journal_of
+    from petrobot.coordinator.run.journal import JournalError, read_header
+    from petrobot.services.comm.location_file import DirectoryError, parse
+
+    try:
+        then = read_header(journal_of(run, folder))
+        if then["mode"] == "realtime":
+            return parse(then["services"], Path(then["services_path"]))
+    except (NoRunError, JournalError, DirectoryError, OSError, LookupError, ValueError):
+        pass
+    return None
 
 
 async def _tell(address: RunAddress, folder: Path) -> str:

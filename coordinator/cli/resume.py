@@ -109,7 +109,7 @@ def later_run(journal: Journal) -> str:
     """Return the newest real-time run on the same nodes that was active after this one was
     interrupted; empty if there is none."""
     from petrobot.coordinator.run.folder import JOURNAL
-    from petrobot.coordinator.run.journal import JournalError, read_journal
+    from petrobot.coordinator.run.journal import JournalError, read_header
 
     own = journal.path
     others = [path for path in own.parent.parent.glob(f"*/{JOURNAL}") if path != own]
@@ -119,7 +119,7 @@ def later_run(journal: Journal) -> str:
         if changed[path] <= changed[own]:
             break
         with contextlib.suppress(JournalError, OSError, LookupError, ValueError):
-            then = read_journal(path).header
+            then = read_header(path)
             if then["mode"] == journal.header["mode"] and _addresses(then) & here:
                 return path.parent.name
     return ""

@@ -196,11 +196,26 @@ class EmergencyLine:
                 self.why = notice.reason
 
 
-async def order_all(directory: Directory, verb: str = STOP, *, bus: bool = False) -> list[Stopped]:
+async def order_all(
+    directory: Directory, verb: str = STOP, *, bus: bool = False, begun: Directory | None = None
+) -> list[Stopped]:
     """Give an order to every node that owns devices, all at once; with `bus`, stop their buses
-    without waiting for the nodes."""
-    nodes = nodes_with_devices(directory)
-    return list(await asyncio.gather(*(_order(directory, node, verb, bus) for node in nodes)))
+    without waiting for the nodes.
+
+    `begun`: what services.toml was when the nodes were started, if it was edited since. A node that
+    is only there, at another address or without devices now, is stopped too, and cleared if it is
+    still stopped."""
+    orders = {_place(directory, node): directory for node in nodes_with_devices(directory)}
+    if begun is not None:
+        then = still_stopped(begun) if verb == CLEAR else nodes_with_devices(begun)
+        orders = {_place(begun, node): begun for node in then} | orders
+    asked = (_order(cell, node, verb, bus) for (node, *_), cell in orders.items())
+    return list(await asyncio.gather(*asked))
+
+
+def _place(directory: Directory, node: str) -> tuple[str, str, int]:
+    entry = directory.nodes[node]
+    return node, entry.host, entry.port
 
 
 async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopped:

@@ -3,8 +3,11 @@ which old runs are removed."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import platform
 import shutil
+import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -78,6 +81,26 @@ def retain(folder: Path, keep: int) -> list[str]:
     for path in removed:
         shutil.rmtree(path)
     return [path.name for path in removed]
+
+
+SKEW = 60 * 10**9
+"""How far another computer's clock, such as a file server's, may be ahead (ns)."""
+
+
+def date_back(folder: Path) -> None:
+    """Call it when a run begins. Files of earlier runs from the future were written before the
+    clock was set back: date them before the new run, in their order. Otherwise one of them would
+    remain the newest run, and `retain` would remove the new ones."""
+    dated: list[tuple[int, Path]] = []
+    for name in (JOURNAL, RESULT):
+        for path in folder.glob(f"*/{name}"):
+            with contextlib.suppress(OSError):
+                dated.append((path.stat().st_mtime_ns, path))
+    now = time.time_ns()
+    late = sorted((at, path) for at, path in dated if at > now + SKEW)
+    for number, (_, path) in enumerate(late):
+        with contextlib.suppress(OSError):  # it belongs to another user
+            os.utime(path, ns=(now - SKEW + number,) * 2)
 
 
 def still_there(path: Path) -> Path:

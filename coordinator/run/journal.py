@@ -30,6 +30,7 @@ from typing import Any
 
 import msgpack
 
+from petrobot.coordinator.run.folder import date_back
 from petrobot.services.host.whole_file import make_folder, sync_folder
 
 FORMAT = 1
@@ -97,6 +98,7 @@ class JournalWriter:
                 text = f"{path}: {fault.strerror}; give --journal a folder that can be written"
                 raise JournalError(text) from fault
             self._take(path)
+            date_back(path.parent.parent)
             self._buffer += MAGIC
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
@@ -263,6 +265,19 @@ def read_journal(path: Path) -> Journal:
     if written != FORMAT:
         raise JournalError(f"{path}: {_other_format(written)}")
     return Journal(path, records[0].data, tuple(records[1:]), len(raw) - offset, offset)
+
+
+def read_header(path: Path) -> Mapping[str, Any]:
+    """Return the header of a journal without reading the rest. Raises JournalError, OSError."""
+    start = len(MAGIC) + PREFIX.size
+    with path.open("rb") as file:
+        raw = file.read(start)
+        if raw.startswith(MAGIC) and len(raw) == start:
+            raw += file.read(PREFIX.unpack_from(raw, len(MAGIC))[0])
+    payload = _payload(raw, len(MAGIC)) if raw.startswith(MAGIC) else None
+    if payload is None:
+        raise JournalError(f"{path}: has no whole header; the run had not begun")
+    return _record(path, payload, 0).data
 
 
 def _foreign(raw: bytes) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,17 @@ def test_the_oldest_ended_runs_are_removed_but_never_one_without_result(tmp_path
     assert retain(tmp_path, 2) == ["a", "b"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["c", "d", "killed"]
     assert retain(tmp_path, 2) == []
+
+
+def test_runs_from_before_the_clock_was_set_back_are_older_than_a_new_one(tmp_path: Path) -> None:
+    """A clock that was wrong once made its last run the newest for years."""
+    far = 1e9 - time.time() - 1e6
+    for name, age in (("a", 0), ("b", int(far)), ("c", int(far) - 100)):
+        a_run(tmp_path, name, age)
+    JournalWriter(tmp_path / "new" / JOURNAL, {}).close()
+    assert journal_of("last", tmp_path).parent.name == "new"
+    (tmp_path / "new" / RESULT).write_text("{}")
+    assert retain(tmp_path, 2) == ["a", "b"]
 
 
 @pytest.mark.parametrize("name", ["new", "last"])

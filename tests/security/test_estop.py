@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,8 +22,9 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
 from petrobot.coordinator.operator.emergency_stop import still_stopped
-from petrobot.coordinator.operator.run_address import find_address
-from petrobot.coordinator.run.folder import NoRunError
+from petrobot.coordinator.operator.run_address import RunAddress, find_address, published
+from petrobot.coordinator.run.folder import NoRunError, header
+from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
@@ -309,20 +311,64 @@ async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> 
     )
 
 
+ONE_NODE = """schema = 1
+[nodes.pc]
+host = "127.0.0.1"
+port = {}
+[devices.axis]
+node = "pc"
+driver = "petrobot:Driver"
+"""
+
+
+def renamed(cell: Path) -> None:
+    """Give the only node another name and another port."""
+    cell.write_text(ONE_NODE.replace("pc", "robot").format(*free_ports(1)))
+
+
+@pytest.mark.parametrize(
+    ("edit", "code"),
+    [
+        (lambda cell: cell.write_text("schema = 1\n[nodes.pc"), 0),
+        (lambda cell: cell.unlink(), 0),
+        (renamed, 3),
+    ],
+    ids=["not TOML", "removed", "renamed"],
+)
+async def test_a_file_that_was_edited_in_mid_run_does_not_keep_a_stop_from_its_nodes(
+    tmp_path: Path, edit: Callable[[Path], Any], code: int
+) -> None:
+    """A slip of the editor disarmed the stop, and a node that had another name meanwhile was not
+    stopped. The stop is cleared where it was stored."""
+    cell = tmp_path / "services.toml"
+    cell.write_text(ONE_NODE.format(*free_ports(1)))
+    node = petrobot("node", "pc", "--services", str(cell))
+    try:
+        assert node.stdout is not None
+        ready = asyncio.to_thread(node.stdout.readline)
+        assert "ready" in await asyncio.wait_for(ready, LIMIT)
+        then = header("run", "", cell.read_text(), "realtime", {"services_path": str(cell)})
+        JournalWriter(tmp_path / "runs" / "run" / "run.journal", then).close()
+        edit(cell)
+        address = RunAddress("run", "http://127.0.0.1:9", "token", os.getpid(), str(cell))
+        journal = ["--journal", str(tmp_path / "runs")]
+        with published(tmp_path / "runs" / "run", address):
+            said = await finished(petrobot("estop", *journal))
+        assert said[0] == code and re.search("^pc +axis +stopped$", said[1], re.M), said
+        services = ["--services", str(cell), *journal]
+        said = await finished(petrobot("estop", "--clear", *services))
+        assert said[0] == 0 and re.search("^pc +axis +cleared$", said[1], re.M), said
+    finally:
+        node.terminate()
+        await finished(node)
+
+
 async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_cleared(
     tmp_path: Path,
 ) -> None:
     """The copy of the caller said for ever that the node was stopped, with a remedy that did
     nothing."""
-    (port,) = free_ports(1)
-    cell = f"""schema = 1
-[nodes.pc]
-host = "127.0.0.1"
-port = {port}
-[devices.axis]
-node = "pc"
-driver = "petrobot:Driver"
-"""
+    cell = ONE_NODE.format(*free_ports(1))
     for name in ("here", "there"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "services.toml").write_text(cell)

@@ -42,10 +42,8 @@ async def outcome_of(client: Client) -> m.Outcome:
 
 
 def context(folder: Path, party: str) -> ssl.SSLContext:
-    """Return the TLS context of a client with this party's certificate."""
-    made = Credentials(party, None, folder).client()
-    assert made is not None
-    return made
+    """Return the TLS context of a client with this party's certificate, whoever made that."""
+    return Credentials(party, None, folder)._load(folder, listens=False)
 
 
 async def test_a_client_with_a_certificate_of_the_cell_is_served(
@@ -215,6 +213,18 @@ def give_password(key: Path) -> None:
     )
 
 
+def put(folder: Path, one: str, other: str) -> None:
+    """Put the files of one party in the place of those of another."""
+    for kind in ("pem", "key"):
+        shutil.copy(folder / f"{one}.{kind}", folder / f"{other}.{kind}")
+
+
+def of_another_authority(folder: Path) -> None:
+    """Give a node the certificate that another authority made for it."""
+    make_certificates(folder / "theirs", ["vision"])
+    put(folder, "theirs/vision", "vision")
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -230,6 +240,8 @@ def give_password(key: Path) -> None:
         ),
         (lambda folder: (folder / "ca.pem").unlink(), "cannot use the certificate of vision"),
         (lambda folder: give_password(folder / "vision.key"), "has a password"),
+        (lambda folder: put(folder, "motion", "vision"), "vision.pem: .*not valid for 'vision'"),
+        (of_another_authority, "vision.pem: .*authority.*issuer certificate; copy vision's"),
     ],
 )
 def test_bad_files_give_one_clear_error(

@@ -41,6 +41,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.security import UNPROVEN, Keys
 from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
+from petrobot.services.comm.tls.credentials import EXPIRED, NOT_YET_VALID
 
 _log = logging.getLogger(__name__)
 
@@ -58,10 +59,6 @@ _LASTING = _FOR_GOOD.union(KEY_CODES, ("directory", "old_epoch"))
 """Refusals that stay until a person has changed something."""
 _FOREIGN = ("malformed", "unknown_kind", "too_large")
 """What the first bytes of a program that is not a node of petrobot look like."""
-_EXPIRED = 10
-"""X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
-_NOT_YET_VALID = 9
-"""X509_V_ERR_CERT_NOT_YET_VALID; many small computers have no clock that runs without power."""
 _NUMBERS = itertools.count(1)
 """Numbers of calls, shared by all clients of this process because two of them may have the same
 name and boot."""
@@ -382,11 +379,11 @@ class Client:
     def _said(self, fault: Exception) -> str:
         """Return why there is no connection, in words."""
         if isinstance(fault, ssl.SSLCertVerificationError):
-            if fault.verify_code == _EXPIRED:
+            if fault.verify_code == EXPIRED:
                 peer = self.caller.peer
                 text = f"the certificate of {peer}, or that of its authority, has expired"
                 return f"{text}; make a new one with `petrobot keys --tls` and copy it to {peer}"
-            early = fault.verify_code == _NOT_YET_VALID
+            early = fault.verify_code == NOT_YET_VALID
             clock = "; set the clock of this computer" if early else ""
             return f"expected the certificate of {self.caller.peer}: {fault.verify_message}{clock}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
@@ -398,6 +395,7 @@ class Client:
             said = os.strerror(fault.errno).lower()  # asyncio's text only repeats the address
         return (
             f"{said}; {NOT_TRUSTED}"
-            if self.tls is not None and isinstance(fault, ConnectionError)
+            if self.tls is not None
+            and isinstance(fault, ConnectionResetError | ConnectionAbortedError)
             else said
         )

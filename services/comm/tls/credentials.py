@@ -11,6 +11,7 @@ operator.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import sys
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
     import ssl
 
 CA_FILE: Final = "ca.pem"
+EXPIRED: Final = 10
+"""X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
+NOT_YET_VALID: Final = 9
+"""X509_V_ERR_CERT_NOT_YET_VALID; many small computers have no clock that runs without power."""
 MADE_BY: Final = "`petrobot keys --tls`"
 RENEW: Final = "run {command} where the authority's key is, and copy {name}.pem and {name}.key here"
 RENEW_CA: Final = (
@@ -94,11 +99,22 @@ class Credentials:
     def _context(self, listens: bool) -> ssl.SSLContext | None:
         if self.folder is None:
             return None
+        server, client = self._load(self.folder, True), self._load(self.folder, False)
+        if why := _not_accepted(server, client, self.party):
+            raise KeyFileError(
+                f"{self.folder / self.party}.pem: expected a certificate of {self.party} by the "
+                f"authority in {CA_FILE}, as the rest of the cell does: {why}; copy "
+                f"{self.party}'s files and {CA_FILE} here from where {MADE_BY} was run"
+            )
+        self.tell_ends()
+        return server if listens else client
+
+    def _load(self, folder: Path, listens: bool) -> ssl.SSLContext:
         # Here, because each worker imports this module, and few cells have certificates.
         import ssl
 
         certificate, key, ca = (
-            self.folder / name for name in (f"{self.party}.pem", f"{self.party}.key", CA_FILE)
+            folder / name for name in (f"{self.party}.pem", f"{self.party}.key", CA_FILE)
         )
         try:
             read_secret(key)
@@ -121,12 +137,31 @@ class Credentials:
                 or getattr(fault, "reason", "")
                 or type(fault).__name__
             )
-            text = f"{self.folder}: cannot use the certificate of {self.party} ({reason})"
+            text = f"{folder}: cannot use the certificate of {self.party} ({reason})"
             raise KeyFileError(
                 f"{text}; make them with {MADE_BY} and copy {self.party}'s files here"
             ) from None
-        self.tell_ends()
         return context
+
+
+def _not_accepted(server: ssl.SSLContext, client: ssl.SSLContext, party: str) -> str:
+    """Return why the rest of the cell will not accept the certificate of `party`, found by a
+    handshake with itself in memory; empty if it will, once its time has come or it is renewed.
+    Without this a node that nobody can reach would count as ready."""
+    import ssl
+
+    asked, answered = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (
+        client.wrap_bio(answered, asked, server_hostname=party),
+        server.wrap_bio(asked, answered, server_side=True),
+    )
+    try:
+        for end in ends + ends:
+            with contextlib.suppress(ssl.SSLWantReadError):
+                end.do_handshake()
+    except ssl.SSLCertVerificationError as fault:
+        return "" if fault.verify_code in (EXPIRED, NOT_YET_VALID) else str(fault.verify_message)
+    return ""
 
 
 def _no_password() -> str:
