@@ -313,17 +313,19 @@ class _Check:
         itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer, or for a thread
         that runs and holds the interpreter's lock. `sleep` takes too long if a thread holds the
         lock and does not run."""
-        before = getrusage(RUSAGE_THREAD).ru_nvcsw
-        idle = time.perf_counter() - time.process_time() - self.scheduled()[1]
+        before, asked = getrusage(RUSAGE_THREAD).ru_nvcsw, method == self.sleep
+        begin, used = time.perf_counter(), time.process_time() + self.scheduled()[1]
         try:
             return method(*given)
         finally:
-            idle = time.perf_counter() - time.process_time() - self.scheduled()[1] - idle
-            slept = getrusage(RUSAGE_THREAD).ru_nvcsw > before
-            if method == self.sleep:
-                slept, idle = threading.active_count() > 1, idle - given[0]
-            if idle > max(WAIT, self.period) and slept:
-                self.waits.setdefault(method.__name__, []).append(idle)
+            idle = time.perf_counter() - begin - (given[0] if asked else 0.0)
+            if idle > max(WAIT, self.period):  # else its cause, which takes long to read, is equal
+                idle -= time.process_time() + self.scheduled()[1] - used
+                slept = getrusage(RUSAGE_THREAD).ru_nvcsw > before
+                if idle > max(WAIT, self.period) and (
+                    threading.active_count() > 1 if asked else slept
+                ):
+                    self.waits.setdefault(method.__name__, []).append(idle)
 
     def scheduled(self) -> tuple[float, float]:
         """Return how long this thread has run, and how long it has waited for a processor (s; 0

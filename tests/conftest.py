@@ -4,13 +4,15 @@ starts processes says so."""
 from __future__ import annotations
 
 import atexit
+import fcntl
 import gc
 import os
 import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -90,3 +92,28 @@ def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
     assert not _started or item.get_closest_marker("processes"), (
         f"mark it `processes`: it starts {_started[0]}"
     )
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Make a folder once for all workers of a session, where that is expensive:
+    `shared("name", make)` calls `make(folder)` in the first process that asks, while others wait.
+    No test may change what it holds."""
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder = base / f"shared-{name}"
+        with (base / f"shared-{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it if this process is killed
+            if not folder.exists():
+                try:
+                    folder.mkdir()
+                    make(folder)
+                except BaseException:
+                    shutil.rmtree(folder)
+                    raise
+        return folder
+
+    return made

@@ -13,7 +13,7 @@ import sys
 import sysconfig
 import time
 import venv
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,9 +66,14 @@ class Installed:
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+def installed(shared: Callable[..., Path]) -> Installed:
+    """The environment and the folder; both tests use one, perhaps in two processes."""
+    base = shared("installed", install)
+    return Installed(base / "env" / "bin" / "python", base / "robot")
+
+
+def install(base: Path) -> None:
     """Build the wheel from a copy, and install it beside foreign packages of the old names."""
-    base = tmp_path_factory.mktemp("installed")
     copy = base / "source"
     left_out = (".*", "build", "*.egg-info", "reports", "runs", "tests", "tools", "docs")
     shutil.copytree(ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(*left_out))
@@ -84,12 +89,10 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
     # The dependencies are those of this environment; a path in a .pth file brings no checkout with
     # it, since .pth files there are not read again.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
-    folder = base / "robot"
-    for where in (site, folder):
+    for where in (site, base / "robot"):
         for name in ("services", "coordinator", "sim", "tests"):
             (where / name).mkdir(parents=True)
             (where / name / "__init__.py").write_text(FOREIGN, encoding="utf-8")
-    return Installed(python, folder)
 
 
 def test_nothing_of_this_checkout_is_imported(installed: Installed) -> None:

@@ -156,7 +156,7 @@ class Draft:
 
     def leave(self, run: Run) -> None:
         """Take a run's token out of its place."""
-        self.tokens[run.place] = tuple(r for r in self.tokens[run.place] if r.id != run.id)
+        self.tokens[run.place] = tuple([r for r in self.tokens[run.place] if r.id != run.id])
         self.told.discard(run.id)
 
     def put(self, old: Run, **changes: object) -> Run:

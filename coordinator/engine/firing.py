@@ -327,7 +327,13 @@ def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = Tr
     present = draft.tokens.get(arc.name)
     if not present:
         return []
-    runs = [r for r in present if _fits(arc, r) and r.id not in claims.runs]
+    # Most runs of a crowded place wait in a queue: those are told apart here, without a call.
+    done, active = Phase.DONE, arc.end is End.PREEMPT or arc.end is End.GOING
+    runs = [
+        r
+        for r in present
+        if (active or r.phase is done) and _fits(arc, r) and r.id not in claims.runs
+    ]
     if heard and arc.raised:
         runs = [
             r

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -68,9 +69,14 @@ def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> di
 
 
 @pytest.fixture(scope="module")
-def usual(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def usual(shared: Callable[..., Path]) -> dict[str, Any]:
     """Return the result of the shipped placement in one process."""
-    result = run(services_file(tmp_path_factory.mktemp("usual")))
+
+    def make(folder: Path) -> None:
+        (folder / "usual.json").write_text(json.dumps(run(services_file(folder))), "utf-8")
+
+    folder = shared("lockstep-cell", make)
+    result: dict[str, Any] = json.loads((folder / "usual.json").read_text("utf-8"))
     assert result["status"] == "success"
     assert result["caught"] == 2
     return result

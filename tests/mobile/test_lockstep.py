@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +48,15 @@ def run(
 
 
 @pytest.fixture(scope="module")
-def usual() -> dict[str, Any]:
+def usual(shared: Callable[..., Path]) -> dict[str, Any]:
     """A run over straight and arc interruptions."""
-    return run(20500, "mixed")
+
+    def make(folder: Path) -> None:
+        (folder / "usual.json").write_text(json.dumps(run(20500, "mixed")), "utf-8")
+
+    folder = shared("rover-cell", make)
+    result: dict[str, Any] = json.loads((folder / "usual.json").read_text("utf-8"))
+    return result
 
 
 def test_a_run_ends_at_the_t(usual: dict[str, Any]) -> None:

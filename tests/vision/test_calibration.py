@@ -3,6 +3,7 @@ alone; files and command."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -51,15 +52,18 @@ def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(shared: Callable[..., Path]) -> Path:
     """Take board images with the simulated camera, as an operator would, and calibrate from them
     (`made.toml`)."""
-    place = tmp_path_factory.mktemp("views") / "views"
-    made = place.with_name("made.toml")
-    with redirect_stdout(StringIO()) as said:
-        assert main(["calibrate", "--views", str(place), "--simulated", "--output", str(made)]) == 0
-    assert "board seen whole in" in said.getvalue() and str(made) in said.getvalue()
-    return place
+
+    def take(base: Path) -> None:
+        made = base / "made.toml"
+        told = ["--views", str(base / "views"), "--simulated", "--output", str(made)]
+        with redirect_stdout(StringIO()) as said:
+            assert main(["calibrate", *told]) == 0
+        assert "board seen whole in" in said.getvalue() and str(made) in said.getvalue()
+
+    return shared("calibration", take) / "views"
 
 
 @pytest.fixture(scope="module")
