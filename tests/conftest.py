@@ -104,16 +104,14 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
         base = base.parent
 
     def made(name: str, make: Callable[[Path], object]) -> Path:
-        folder = base / f"shared-{name}"
+        folder, done = base / f"shared-{name}", base / f"shared-{name}.done"
         with (base / f"shared-{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it if this process is killed
-            if not folder.exists():
-                try:
-                    folder.mkdir()
-                    make(folder)
-                except BaseException:
-                    shutil.rmtree(folder)
-                    raise
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                done.touch()
         return folder
 
     return made
