@@ -428,6 +428,8 @@ def main() -> int:
         for m in MUTATIONS
         if not options.words or any(word in m.name or word in m.file for word in options.words)
     ]
+    if not chosen:
+        parser.error(f"no fault has one of {', '.join(options.words)} in its name or file")
     tests = sorted({test for m in chosen for test in m.tests})
     if not options.trust:
         with scratch() as copy:
