@@ -420,7 +420,7 @@ def text_of(result: dict[str, Any]) -> str:
             lines.append(f"  {'':{wide}}{table}: {counted}")
     lines += _task_line(result.get("task_figures") or {}, wide)
     for task, actions in result["chosen"].items():
-        if len(actions) > 1:
+        if [*actions] != [task]:  # else there is nothing to choose, and the names are equal
             shown = ", ".join(
                 f"{a} {n}" + _in_brackets(result, task, a) for a, n in actions.items()
             )
