@@ -193,7 +193,8 @@ def _event(task: Task, e: Event) -> Iterator[Fault]:
     key = f"events.{e.name}"
     if e.scope is Scope.INTERNAL and e.by not in task.primitive_tasks:
         remedy = f"`by` names the one that raises it{nearest(e.by, task.primitive_tasks)}"
-        yield Fault(f"{key}.by", f"unknown primitive task {e.by!r}", remedy)
+        text = f"unknown primitive task {e.by!r}" if e.by else "missing, as the event is internal"
+        yield Fault(f"{key}.by", text, remedy)
     if e.scope is Scope.EXTERNAL and e.by:
         yield Fault(
             f"{key}.by",

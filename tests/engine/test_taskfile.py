@@ -180,7 +180,7 @@ def test_a_place_that_is_named_like_no_primitive_task_must_name_one() -> None:
             "variables.seen.values",
             "make the type str",
         ),
-        ('scope = "external"', 'scope = "internal"', "events.tick.by", "unknown primitive task"),
+        ('scope = "external"', 'scope = "internal"', "events.tick.by", "missing, as the event is"),
         (
             'scope = "external"',
             'scope = "external"\nearly = "keep"',

@@ -516,7 +516,7 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
     out = [
         "simulated trials with the training's own choices differ from the measured ones: "
         f"{row['of']}, off by {row['off']:.1%} (p = {row['p_holm']:.1e}); a campaign that chooses "
-        "as the new trials will (`campaign --learned`) needs none"
+        "as the new trials will (`campaign --learned`) is forecast without them"
         for row in residual
         if row["p_holm"] < LEVEL
         and row["off"] > (OFF_TIME if row["of"] in (TIME, MEAN) else NEGLIGIBLE)
