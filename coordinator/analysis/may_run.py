@@ -234,8 +234,14 @@ def _beside(task: Task, t: Transition) -> list[str]:
             return []
         return [p.name for p in places.values() if p.task and p.name.startswith(use)]
     started = [{o.place for o in u.outputs} for u in task.flat.transitions.values()]
-    together = set[str]().union(*(some for some in started if t.expanded_from in some))
+    started = [some for some in started if t.expanded_from in some] if _is_added(t) else []
+    together = set[str]().union(*started)
     return [p for p in places if p in together - {t.expanded_from} and places[p].task]
+
+
+def _is_added(t: Transition) -> bool:
+    """Return whether it is an error exit that nobody wrote, or a copy of one for `tries`."""
+    return bool(t.expanded_from) and t.name.startswith(f"{t.expanded_from}.error")
 
 
 def _each_use(task: Task, t: Transition, left: Sequence[str]) -> Iterator[Finding]:
@@ -244,16 +250,20 @@ def _each_use(task: Task, t: Transition, left: Sequence[str]) -> Iterator[Findin
     name, places = t.expanded_from or t.name, task.flat.places
     out = [o.place for o in t.outputs if places[o.place].kind is not Kind.RESOURCE]
     uses = [use for use, one in subnets_of(task).items() if one is subnet] or [""]
+    parts = (one.removeprefix(own).partition(".") for one in left)
+    inner = {name for name, dot, _ in parts if dot}
     for use in uses:
         here, *rest = (f"{use}{one.removeprefix(own)}" for one in (name, *left, *out))
         others, to = rest[: len(left)], ", ".join(f'"{one}"' for one in rest[len(left) :])
         taken = ", ".join(f'"{one}:preempt=none"' for one in others)
         key, text = f"transitions.{here}.in", f"leaves {listed(others)} running"
         remedy = f"add {taken}"
-        if here in places:
+        if _is_added(t):
             key = f"places.{here}"
             text = f"{here}.error, which was added because no transition has {here}:error, {text}"
             remedy = f'add to [transitions] one with in = ["{here}:error", {taken}], out = [{to}]'
+        if inner:
+            remedy = f"let one take an exit of {listed(inner)} too: no macro place is preempted"
         yield Finding(Severity.ERROR, LEFT_RUNNING, key, text, remedy)
 
 

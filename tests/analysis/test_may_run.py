@@ -76,6 +76,21 @@ PRESSED = 'pressed = { in = ["listening"], event = "button", out = ["hush"] }\n'
 PRESSED += 'heard = { in = ["hush"], after = 1.0, out = ["listening"] }\n'
 
 
+DEEP = """[subnets.deep]
+entry = "run"
+normal = "ok"
+error = "bad"
+[subnets.deep.places]
+run = { kind = "action", task = "drive" }
+ok = {}
+bad = {}
+[subnets.deep.transitions]
+over = { in = ["run:normal"], out = ["ok"] }
+"""
+INNER = FORK.replace(DROPPED, "").replace(', "drive:preempt=none"', "") + DEEP
+INNER = INNER.replace('drive = { kind = "action" }', 'drive = { kind = "macro", subnet = "deep" }')
+
+
 def found(text: str, code: str) -> list[Finding]:
     report = may_run(loads(text), None, Budget()).report
     return [one for one in report.findings if one.code == code]
@@ -110,8 +125,20 @@ def found(text: str, code: str) -> list[Finding]:
             'add to [transitions] one with in = ["weigh:error", "drive:preempt=none"], '
             'out = ["hurt"]',
         ),
+        (
+            FLAT.replace('weigh = { kind = "action" }', 'weigh = { kind = "action", tries = 3 }'),
+            "places.weigh",
+            "weigh.error, which was added",
+            'in = ["weigh:error", "drive:preempt=none"]',
+        ),
+        (
+            INNER,
+            "subnets.carry.transitions.stopped.in",
+            "leaves drive.run running",
+            "let one take an exit of drive too: no macro place is preempted",
+        ),
     ],
-    ids=["one forgotten", "two forgotten", "written, without its partner", "without a subnet"],
+    ids=["one forgotten", "two", "written, without its partner", "no subnet", "tries", "deeper"],
 )
 def test_an_exit_that_leaves_the_other_branch_running_is_named(
     text: str, key: str, told: str, remedy: str
