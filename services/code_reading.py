@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib.util import decode_source
+from itertools import pairwise
 from pathlib import Path
 from types import CodeType
 from typing import Any, get_args, get_type_hints
@@ -53,6 +54,10 @@ AWAITED = frozenset(
     ("wait", "sleep", "call", "command", "get", "get_versioned", "put", "compare_and_set")
 )
 """Methods of the context that do nothing unless they are awaited."""
+AT_ONCE = frozenset(
+    name for name, one in vars(actions.Context).items() if inspect.isfunction(one)
+).difference(AWAITED)
+"""Methods of the context that return at once: to await what they return fails."""
 CONTEXT = ("ctx", "context")
 """Usual names of the context."""
 PORTS = ("ports", "self.ports", "self._ports")
@@ -471,6 +476,8 @@ def _look_at_nodes(code: _Code, seen: _Seen, in_action: bool) -> None:
                 seen.uses.setdefault(node.attr, (code.file, node.lineno))
         if isinstance(node, ast.While) and in_action:
             _loops(code, node, seen)
+        if isinstance(node, ast.Await) and isinstance(node.value, ast.Call):
+            _awaited_at_once(code, node.value, seen)
         raised = node.exc if isinstance(node, ast.Raise) else None
         if isinstance(raised, ast.Call) and any(code.value(raised.func) is one for one in MADE):
             text = f"`raise {ast.unparse(raised)}`: a result is returned; write `return`"
@@ -527,6 +534,7 @@ def _undefined(code: _Code, seen: _Seen) -> None:
         if hasattr(actions, name):
             remedy = f"; write `from petrobot import {name}`"
         seen.faults.append((code.file, line, f"`{name}` is not defined{remedy}"))
+        seen.complete = False  # it may stand for what makes the result
 
 
 @cache
@@ -587,6 +595,28 @@ def _unawaited(code: _Code, node: ast.Call, seen: _Seen) -> None:
     name = ast.unparse(node.func)
     text = f"`{name}` does nothing without `await`; write `await {name}(...)`"
     seen.faults.append((code.file, node.lineno, text))
+
+
+def _awaited_at_once(code: _Code, node: ast.Call, seen: _Seen) -> None:
+    """Record an `await` of something that returns at once."""
+    owner, _, name = ast.unparse(node.func).rpartition(".")
+    made = code.value(node.func)
+    if (owner in CONTEXT and name in AT_ONCE) or any(made is one for one in MADE):
+        text = f"`await {ast.unparse(node)}`: it returns at once; write it without `await`"
+        seen.faults.append((code.file, node.lineno, text))
+
+
+def _published_late(code: _Code, one: ast.stmt, after: ast.stmt, seen: _Seen) -> None:
+    """Record a set point that is published immediately before the run ends."""
+    orders = {f"{owner}.publish" for owner in CONTEXT}
+    published = isinstance(one, ast.Expr) and isinstance(one.value, ast.Call)
+    if not published or ast.unparse(one.value.func) not in orders:  # type: ignore[attr-defined]
+        return
+    if isinstance(after, ast.Return) and not any(isinstance(n, ast.Await) for n in ast.walk(after)):
+        call = ast.unparse(one)
+        text = f"`{call}` just before `return` is not sent: a stream ends with its run; "
+        text += "write `await ctx.sleep(...)` for a period of the stream between them"
+        seen.doubtful.append((code.file, one.lineno, text))
 
 
 def _draws_unseeded(made: Any, node: ast.Call) -> bool:
@@ -766,6 +796,8 @@ def _kind(code: _Code, node: ast.expr) -> str:
             return code.typed.get(name, "")
         case ast.Constant():
             return _KINDS.get(type(node.value), "")
+        case ast.UnaryOp(op=ast.USub(), operand=positive):
+            return _kind(code, positive)
         case ast.JoinedStr():
             return "str"
         case ast.List() | ast.ListComp():
@@ -853,6 +885,27 @@ def _ends(own: _Code, name: str, seen: _Seen) -> None:
         if isinstance(value, NO_RESULT) or any(own.value(value) is one for one in MADE):
             text = f"`return {ast.unparse(value)}` is not a result; write `return success()`"
             seen.faults.append((own.file, value.lineno, text))
+        for part in _branches(value) if isinstance(own.tree, ast.AsyncFunctionDef) else ():
+            if isinstance(part, ast.Call):
+                _unawaited_result(own, part, seen)
+    for body in (getattr(n, part, ()) for n in own.nodes for part in ("body", "orelse")):
+        for one, after in pairwise(body if isinstance(body, list) else ()):
+            _published_late(own, one, after, seen)
+
+
+def _unawaited_result(own: _Code, call: ast.Call, seen: _Seen) -> None:
+    """Record a result that an action returns without awaiting it."""
+    owner, _, method = (name := ast.unparse(call.func)).rpartition(".")
+    called = f"{owner}.call" == name and owner in CONTEXT
+    if owner in CONTEXT and method in AWAITED and not called:
+        text = f"`return {ast.unparse(call)}` is not a result; write `return success()` after it"
+    elif called or inspect.iscoroutinefunction(own.value(call.func)):
+        text = (
+            f"`return {name}(...)` without `await` does nothing; write `return await {name}(...)`"
+        )
+    else:
+        return
+    seen.faults.append((own.file, call.lineno, text))
 
 
 def _returned(function: ast.AST) -> Iterator[ast.expr]:

@@ -57,6 +57,7 @@ def rehearse(
     device: Any = None,
     services: Mapping[str, Callable[..., Result]] | None = None,
     streams: Mapping[str, float] | None = None,
+    set_points: Mapping[str, Sequence[float]] | None = None,
     memory: Mapping[str, Any] | None = None,
     world: Callable[[float], None] | None = None,
     cancel_after: float | None = None,
@@ -70,7 +71,8 @@ def rehearse(
     gets ports with a clock, `random`, `raise_event` and `stream`, which receives what the action
     publishes), or whatever the action uses as `ctx.device`. `services` answer its calls by name.
     The global memory is there without being named; `memory` are its variables at the beginning.
-    `streams` gives the periods of streams (s; of others one tick). `world(now)` is called each tick
+    `streams` gives the periods of streams (s; of others one tick), and `set_points` what the driver
+    receives by streams of other actions, by stream, all the time. `world(now)` is called each tick
     before the action, to let something happen. With `cancel_after` it is cancelled then. Raises
     StillRunningError when it has not ended after `limit` seconds.
     """
@@ -80,6 +82,8 @@ def rehearse(
     stage.place.take(0.0, Call(RUN, NAME, arguments, seed=seed))
     for tick in range(round(limit / TICK) + 1):
         stage.now = tick * TICK
+        for name, values in (set_points or {}).items():
+            stage.ports.stream(name).take(values)
         if world is not None:
             world(stage.now)
         if cancel_after is not None and stage.now >= cancel_after - 1e-9:
@@ -205,8 +209,8 @@ class _Stage:
     ) -> None:
         self.now = 0.0
         self.played = Rehearsal(error("still_running"), 0.0)
-        self._ports = TestPorts.of(device)
-        self._ports.begin(lambda: self.now, self.played.events, streams, seed)
+        self.ports = TestPorts.of(device)
+        self.ports.begin(lambda: self.now, self.played.events, streams, seed)
         self._services = services
         driver = device if hasattr(device, "stopped") and hasattr(device, "period") else None
         self.place = InlineHost(
@@ -234,7 +238,7 @@ class _Stage:
             played.seconds = report.seconds
         elif isinstance(report, Sent):
             played.published.append((self.now, report.stream, report.values))
-            self._ports.stream(report.stream).take(report.values, report.elapsed)
+            self.ports.stream(report.stream).take(report.values, report.elapsed)
         elif isinstance(report, Event) and report.name.startswith(VERDICT_EVENTS):
             said = RunVerdict.of_data(report.data)
             played.verdicts.append((self.now, said.run, Status(said.status), said.cause))

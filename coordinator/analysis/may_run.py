@@ -6,13 +6,13 @@ answer, not in the question.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.engine import Phase
-from petrobot.coordinator.task import End, Input, Status, Task, Transition
+from petrobot.coordinator.engine import EventOccurred, Phase
+from petrobot.coordinator.task import End, Input, Kind, Scope, Status, Task, Transition
 from petrobot.coordinator.task.check import CheckReport, Finding, Severity, check, in_file
 from petrobot.coordinator.task.check.completeness import (
     EXTERNAL_WAIT,
@@ -21,6 +21,7 @@ from petrobot.coordinator.task.check.completeness import (
     uncovered_exits,
 )
 from petrobot.coordinator.task.check.conflicts import lent
+from petrobot.coordinator.task.check.findings import subnet_of, subnets_of
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
 
@@ -78,6 +79,9 @@ class Budget:
 
         return SearchLimits(states=self.markings)
 
+
+LEFT_RUNNING = "left-running"
+"""Code of the finding that a transition leaves a run behind that should have been preempted."""
 
 LATE = "deadline-too-short"
 """Code of the finding that runs are ended before they succeed, as their place is declared."""
@@ -148,7 +152,8 @@ def may_run(task: Task, cell: Cell | None = None, budget: Budget | None = None) 
     if budget is None:
         return MayRun(task, report, None)
     analysis = _search(task, budget, devices_of(cell))
-    report = CheckReport(in_file(task, _with_graph(report, analysis).findings))
+    found = (*_left_running(task, analysis), *_with_graph(task, report, analysis).findings)
+    report = CheckReport(in_file(task, found))
     return MayRun(task, report, replace(analysis, refused=not report.ok))
 
 
@@ -165,7 +170,7 @@ def _search(task: Task, budget: Budget, devices: Mapping[str, str] | None) -> An
     return analyse(task, limits=budget.limits(), steps=budget.steps, devices=devices)
 
 
-def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
+def _with_graph(task: Task, report: CheckReport, analysis: Analysis) -> CheckReport:
     """Return the findings with what the execution graph shows: retries without a limit, runs that
     stay behind at the end, and conflicts and waits for events in place of those that the arcs
     suggest. Without a complete graph, those stand."""
@@ -186,10 +191,80 @@ def _with_graph(report: CheckReport, analysis: Analysis) -> CheckReport:
     if (late := analysis.progress.ends_by_error) is not None:
         found.append(_ends_by_error(late))
     found += _lost_pulses(analysis.progress.x)
+    found += _awaited_ends(task, analysis.progress.x)
     found += _uncovered(analysis.progress.x) if open_ones else ()
     errors = [f for f in found if f.severity is Severity.ERROR]
     others = [f for f in found if f.severity is not Severity.ERROR]
     return CheckReport((*errors, *rest, *others))
+
+
+def _left_running(task: Task, analysis: Analysis) -> Iterator[Finding]:
+    """Transitions that leave a net after one of its branches while a run of another branch is still
+    there, on the way to what speaks against the task: nothing expects that run any more."""
+    if analysis.progress is None:
+        return
+    x, told = analysis.progress.x, set[str]()
+    net = x.engine.compiled.net
+    for verdict in analysis.objections.values():
+        witness = verdict.witness
+        names = witness.firings if witness and witness.steps else ()
+        for name, marking in zip(names, [*net.replay(names)][1:], strict=True):
+            t = task.flat.transitions[name]
+            left = [p for p in _beside(task, t) if marking[net.place_index[p]]]
+            left = [p for p in left if p in x.crowded or _leads_on(task.flat, p)]
+            if left and name not in told:
+                told.add(name)
+                yield from _each_use(task, t, left)
+
+
+def _leads_on(flat: Task, place: str) -> bool:
+    """Return whether a good end of a place's run moves a token on. One that only takes it away lets
+    the run go on beside the rest, as is meant."""
+    outputs = (o.place for t in flat.exits.get((place, End.NORMAL), ()) for o in t.outputs)
+    return any(flat.places[name].kind is not Kind.RESOURCE for name in outputs)
+
+
+def _beside(task: Task, t: Transition) -> list[str]:
+    """Return the action places whose runs a transition should not leave: those of the subnet that
+    it leaves, and for an added error exit those that start together with its place."""
+    places, out = task.flat.places, {o.place for o in t.outputs}
+    use, subnet = subnet_of(task, t.name)
+    if subnet is not None:
+        if out.isdisjoint({f"{use}{subnet.normal}", f"{use}{subnet.error}"}):
+            return []
+        return [p.name for p in places.values() if p.task and p.name.startswith(use)]
+    started = [{o.place for o in u.outputs} for u in task.flat.transitions.values()]
+    started = [some for some in started if t.expanded_from in some] if _is_added(t) else []
+    together = set[str]().union(*started)
+    return [p for p in places if p in together - {t.expanded_from} and places[p].task]
+
+
+def _is_added(t: Transition) -> bool:
+    """Return whether it is an error exit that nobody wrote, or a copy of one for `tries`."""
+    return bool(t.expanded_from) and t.name.startswith(f"{t.expanded_from}.error")
+
+
+def _each_use(task: Task, t: Transition, left: Sequence[str]) -> Iterator[Finding]:
+    """The finding that a transition leaves runs, once for each use of its subnet."""
+    own, subnet = subnet_of(task, t.name)
+    name, places = t.expanded_from or t.name, task.flat.places
+    out = [o.place for o in t.outputs if places[o.place].kind is not Kind.RESOURCE]
+    uses = [use for use, one in subnets_of(task).items() if one is subnet] or [""]
+    parts = (one.removeprefix(own).partition(".") for one in left)
+    inner = {name for name, dot, _ in parts if dot}
+    for use in uses:
+        here, *rest = (f"{use}{one.removeprefix(own)}" for one in (name, *left, *out))
+        others, to = rest[: len(left)], ", ".join(f'"{one}"' for one in rest[len(left) :])
+        taken = ", ".join(f'"{one}:preempt=none"' for one in others)
+        key, text = f"transitions.{here}.in", f"leaves {listed(others)} running"
+        remedy = f"add {taken}"
+        if _is_added(t):
+            key = f"places.{here}"
+            text = f"{here}.error, which was added because no transition has {here}:error, {text}"
+            remedy = f'add to [transitions] one with in = ["{here}:error", {taken}], out = [{to}]'
+        if inner:
+            remedy = f"let one take an exit of {listed(inner)} too: no macro place is preempted"
+        yield Finding(Severity.ERROR, LEFT_RUNNING, key, text, remedy)
 
 
 def _uncovered(x: ExecutionGraph) -> Iterator[Finding]:
@@ -244,6 +319,31 @@ def _lost_pulses(x: ExecutionGraph) -> Iterator[Finding]:
                 remedy = 'if it must be served then, write memory = "latched" and early = "keep"'
                 key = f"events.{pulses[0]}"
                 yield Finding(Severity.NOTE, "lost-pulse", key, text, remedy)
+
+
+def _awaited_ends(task: Task, x: ExecutionGraph) -> Iterator[Finding]:
+    """Places that only an external event empties, while nothing but their tokens keeps the task
+    from its end: `final` as it is written holds, and asks for nothing there."""
+    import numpy as np
+
+    flat, places = x.engine.compiled.task, x.engine.compiled.net.places
+    outside = np.array([isinstance(one.stimulus, EventOccurred) for one in x.steps], np.bool_)
+    waits = np.zeros(len(x), np.bool_)
+    waits[x.source[outside[x.label] & ~x.by_hand]] = True
+    waits[x.source[~outside[x.label] & ~x.by_hand]] = False
+    found = dict[str, None]()
+    for i in np.flatnonzero(waits & ~x.final).tolist() if task.final != flat.final else ():
+        tokens = dict(zip(places, x.states[i].marking, strict=True))
+        if task.final.holds(tokens):
+            own = (flat.places[name] for name in tokens if tokens[name])
+            found |= {p.name: None for p in own if p.kind is Kind.PLAIN and not p.listen
+                      and p.name not in task.final.names}  # fmt: skip
+    for name in found:
+        takers = [t for t in flat.transitions.values() if name in _places(t)]
+        events = {e for t in takers for e in t.events if flat.events[e].scope is Scope.EXTERNAL}
+        text = f"the end needs the event {listed(events)}, as only that empties this place"
+        remedy = "write `listen = true` here if it need not come"
+        yield Finding(Severity.NOTE, "awaited-end", f"places.{name}", text, remedy)
 
 
 def _places(t: Transition) -> set[str]:

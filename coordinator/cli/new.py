@@ -355,7 +355,7 @@ def _robot(name: str, folder: Path) -> tuple[dict[Path, str], str]:
         f"cd {project}, then:\n  petrobot check {name}.toml\n"
         f"  petrobot run {name}.toml --mode lockstep   # simulated time\n"
         f"  petrobot run {name}.toml --up              # real time\n"
-        "  pytest"
+        "  pytest                                # first: pip install pytest"
     )
     return {project / f"{name}.py": code, **files}, hint
 

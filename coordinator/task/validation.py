@@ -235,6 +235,7 @@ class _Names:
         self.types |= {name: variable.type for name, variable in task.variables.items()}
         self.types |= {n: VariableType(k) for n, k in kinds if k in {*VariableType}}
         """Types of what may be read, where they are known."""
+        self.values = {name: variable.values for name, variable in task.variables.items()}
         self.read = {*self.written, *task.parameters, *parameters} - self.places
 
 
@@ -295,8 +296,20 @@ def _sets(names: _Names, key: str, t: Transition) -> Iterator[Fault]:
                 "write 'text', 3, true, none, or the name of a variable or parameter",
             )
         elif unknown := sorted(expression.names - names.read):
-            remedy = f"texts stand in quotes: \"'{unknown[0]}'\"{nearest(unknown[0], names.read)}"
+            remedy = _literals(names.types.get(name, ""), names.values.get(name, ()), unknown[0])
+            remedy += nearest(unknown[0], names.read)
             yield Fault(f"{key}.set.{name}", f"{unknown[0]!r} is not a variable", remedy)
+
+
+def _literals(kind: str, values: Collection[str], text: object) -> str:
+    """Say which literals `set` may write into a variable of this type, where it has `text`."""
+    if values and text not in values:
+        return "write one of " + few([f"\"'{value}'\"" for value in values])
+    if kind == VariableType.BOOL:
+        return "write true or false"
+    if kind in (VariableType.INT, VariableType.FLOAT):
+        return f"write {'a whole number' if kind == VariableType.INT else 'a number'}"
+    return f"texts stand in quotes: \"'{text}'\""
 
 
 def _short_forms(
@@ -693,9 +706,10 @@ def _value(
             yield Fault(key, text, "change one of the types")
     elif isinstance(tree, Literal):
         if not VariableType(into.kind).admits(tree.value):
-            yield Fault(key, f"{tree.value!r} is not of type {into.kind}", "change one of them")
+            remedy = _literals(into.kind, into.values, tree.value)
+            yield Fault(key, f"{tree.value!r} is not of type {into.kind}", remedy)
         elif into.values and tree.value is not None and tree.value not in into.values:
-            remedy = f"use one of {listed(into.values)}"
+            remedy = _literals(into.kind, into.values, tree.value)
             yield Fault(key, f"{tree.value!r} is not among the `values` of {name}", remedy)
 
 

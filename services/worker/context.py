@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -78,6 +79,12 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Outco
     """Return what an action or a service returned as an outcome of plain data that can be sent.
     Raises ValueError if that is impossible; `where` names the values in its text."""
     try:
+        if inspect.iscoroutine(returned):
+            returned.close()  # else Python would warn of it
+            name = returned.__name__
+            raise ValueError(
+                f"returned {name}(...) without `await`; write `return await {name}(...)`"
+            )
         if not isinstance(returned, Result):
             name = type(returned).__name__
             raise ValueError(f"returned a {name}; return success(), failure() or error()")

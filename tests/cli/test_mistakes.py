@@ -381,6 +381,19 @@ IN_THE_CODE: list[Mistake] = [
         "def step(self)",
         r"`step` of Axis takes \(self\), but is called with \(self, now\); write",
     ),
+    (
+        CODE,
+        "    return success()",
+        "    return late(ctx)\n\n\nasync def late(ctx: Context[Remote]) -> Result:\n"
+        "    return success()",
+        r"arm_bot.py:\d+: `return late\(...\)` without `await` does nothing; write `return aw",
+    ),
+    (
+        CODE,
+        "await ctx.sleep(0.3)",
+        "await ctx.progress(0.5)",
+        r"arm_bot.py:\d+: `await ctx.progress\(0.5\)`: it returns at once; write it without `awa",
+    ),
     (CODE, "return {", "{", r"arm_bot.py:\d+: `state` of Axis returns nothing; write `return`"),
     (CODE, "return self.at ==", "self.at ==", r"`stopped` of Axis returns nothing; write"),
     (CODE, "def step(", "def steps(", r"`steps` of Axis is never called; did you mean `step`"),
@@ -748,6 +761,7 @@ COMMANDED = '    await ctx.command({"to": to})\n'
 
 MEMORISES = (CELL, "[actions]", '[services]\nmemory = { node = "pc" }\n\n[actions]', "")
 STREAM = (CELL, "[actions]", '[streams]\nlamp = { to = "axis", period = 0.1 }\n\n[actions]', "")
+SHOWS = 'ctx.publish("lamp", [1.0])'
 
 EYE = "class Eye(Driver):\n    def look(self) -> int:\n        return 3\n\n\n"
 SEEN = [
@@ -789,6 +803,18 @@ BOTH: list[tuple[list[Mistake], str]] = [
     (
         [STREAM, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", {"on": 1.0})', "")],
         r"`ctx.publish\('lamp', {'on': 1.0}\)`: .* write `ctx.publish\('lamp', \[...\]\)`",
+    ),
+    (
+        [STREAM, (CODE, "await ctx.sleep(0.3)", 'ctx.publish("lamp", -1.7)', "")],
+        r"`ctx.publish\('lamp', -1.7\)`: set points are a list of numbers; write",
+    ),
+    (  # what follows from an undefined name is not told
+        [
+            (TASK, "args = { to = 0.2 }", 'args = { to = 0.2 }, out = { at = "w" }', ""),
+            (TASK, "[places]", '[variables.w]\ntype = "float"\n\n[places]', ""),
+            (CODE, "return success(at", "return sucess(at", ""),
+        ],
+        r"^\S+: may not run because of arm_bot.py:\d+\n+error +arm_bot.py:\d+: `sucess` is not def",
     ),
     (
         [
@@ -895,11 +921,24 @@ DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
     ),
     (
         [
-            (TASK, "[places]", TYPED.replace("float", "str"), ""),
+            (TASK, "[places]", TYPED, ""),
+            (TASK, "args = { to = 0.2 }", 'args = { to = { var = "w" } }', ""),
+        ],
+        r":\d+: variables.w: places.fetch.args reads it, but no run writes it .* w is none there",
+        [(TASK, "args = { to = { var", 'out = { at = "w" }, args = { to = { var', "")],
+    ),
+    (
+        [
+            (TASK, "[places]", TYPED.replace('"float"', '"str"\ninitial = "0.2"'), ""),
             (TASK, "args = { to = 0.2 }", 'args = { to = { var = "w" } }', ""),
         ],
         r":\d+: places.fetch.args.to: .* expects to: float, found w, which is str",
-        [(TASK, 'type = "str"', 'type = "int"', "")],
+        [(TASK, 'type = "str"\ninitial = "0.2"', 'type = "int"\ninitial = 0', "")],
+    ),
+    (
+        [STREAM, (CODE, "    return success()", f"    {SHOWS}\n    return success()", "")],
+        r":\d+: `ctx.publish\('lamp', \[1.0\]\)` just before `return` is not sent",
+        [(CODE, f"    {SHOWS}\n", f"    {SHOWS}\n    await ctx.sleep(0.1)\n", "")],
     ),
     (
         [READS, (CELL, "[actions]", MEMORY, "")],
@@ -934,6 +973,11 @@ HELPER = (
     "async def close(ctx: Context[Remote]) -> None:\n    await ctx.sleep(0.3)\n\n\nasync def grip"
 )
 
+LATE = (
+    "async def beyond(ctx: Context[Remote]) -> Result:\n    return success()\n\n\n"
+    "late: Any = beyond\n\n\nasync def grip"
+)
+
 IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
     (
         [
@@ -943,6 +987,14 @@ IN_THE_RUN: list[tuple[list[Mistake], int, str]] = [
         0,
         r"error +grip#\d, grip on pc for grip: exception:.*'close' was never awaited in grip \("
         r"arm_bot.py:\d+\): it did nothing.*only 0 of 3 goals were met; the exit code is 0 because",
+    ),
+    (  # and Python's own warning is not shown beside it
+        [
+            (CODE, "async def grip", LATE, ""),
+            (CODE, "    await ctx.sleep(0.3)\n    if", "    return late(ctx)\n    if", ""),
+        ],
+        0,
+        r"\A(?!.*never awaited).*bad_result: returned beyond\(...\) without `await`; write `return",
     ),
     (
         [(CODE, "await ctx.sleep(0.3)", "ctx.sleep(0.3)", "")],
@@ -1279,6 +1331,8 @@ NOT_LOST = (TASK, 'lost = { in = ["grip:error"] }', "", "")
 NO_BRANCH = r"arm_bot.toml:43: subnets.hold.places.close: no outgoing arc `error`"
 USED = "await ctx.sleep(0.3)"
 DRIVES = ("command", "stop", "stopped")
+LETTERS = 'type = "str"\nvalues = ["a", "b"]\ninitial = "a"'
+RAISED = 'self.ports.raise_event("button")\n        if not self.paused:'
 
 OUTER = [
     *SUBNET,
@@ -1422,6 +1476,57 @@ REMEDIES: list[tuple[list[Mistake], str, list[Mistake]]] = [
         [(TASK, '"carry:normal"] }', '"carry:normal"], set = { n = 1 } }', "")],
         r"transitions.delivered.set.n: 'n' is not a variable; declare it in \[variables\]",
         [(TASK, "[places]", '[variables]\nn = { type = "int" }\n[places]', "")],
+    ),
+    *(
+        (
+            [
+                (TASK, '"carry:normal"] }', f'"carry:normal"], set = {{ n = {wrong} }} }}', ""),
+                (TASK, "[places]", f"[variables]\nn = {{ {kind} }}\n[places]", ""),
+            ],
+            rf"transitions.delivered.set.n: {told}",
+            [(TASK, f"n = {wrong}", f"n = {right}", "")],
+        )
+        for kind, wrong, told, right in (
+            ('type = "bool"', '"yes"', "'yes' is not a variable; write true or false", "true"),
+            ('type = "bool"', "1", "1 is not of type bool; write true or false", "false"),
+            ('type = "int"', '"three"', "'three' is not a variable; write a whole number", "3"),
+            ('type = "str"', '"yes"', "'yes' is not a .*; texts stand in quotes: ", "\"'yes'\""),
+            (
+                'type = "str", values = ["a", "b"]',
+                '"c"',
+                "'c' is not a variable; write one of \"'a'\", \"'b'\"",
+                "\"'b'\"",
+            ),
+        )
+    ),
+    (
+        [
+            (TASK, "[places]", f"[variables.w]\n{LETTERS}\n\n[places]", ""),
+            (TASK, 'in = ["grip:normal"]', 'when = "w == \'A\'", in = ["grip:normal"]', ""),
+        ],
+        r"gripped.when: in .*, 'w' is never 'A' at column 6; it may be 'a', 'b'",
+        [(TASK, "'A'", "'a'", "")],
+    ),
+    (
+        [
+            (TASK, '"action", tries', '"action", out = { wide = "width" }, tries', ""),
+            (TASK, "[places]", '[variables.width]\ntype = "float"\n\n[places]', ""),
+            (CODE, "return success()", "return success(width=0.1)", ""),
+        ],
+        r"grip.out.wide: no action of grip returns a value 'wide', but width .*write width = \"w",
+        [(TASK, "wide =", "width =", "")],
+    ),
+    (
+        [
+            (TASK, "[places]", '[events.button]\nscope = "external"\n\n[places]', ""),
+            (CODE, "if not self.paused:", RAISED, ""),
+            (CODE, USED, 'ctx.raise_event("button")', ""),
+        ],
+        r"'grip' raises the event 'button', which is external: only a driver .*of another name, d",
+        [
+            (CODE, 'ctx.raise_event("button")', 'ctx.raise_event("shut")', ""),
+            (TASK, "[places]", '[events.shut]\nby = "grip"\n[places]', ""),
+        ],
     ),
     (
         [(TASK, 'kind = "action", tries', 'task = "grip", tries', "")],
@@ -1677,7 +1782,6 @@ def test_a_timer_whose_name_is_no_event_of_the_task_is_told(
     expect(told, CHECK, 0)
 
 
-RAISED = 'self.ports.raise_event("button")\n        if not self.paused:'
 TIMER = '[timers.button]\nnode = "pc"\nperiod = 1.0\n\n[nodes]'
 
 

@@ -631,7 +631,13 @@ def test_conditions_of_the_same_step_read_the_old_value() -> None:
             "neither a literal nor a name",
         ),
         (SHORT, "bin = \"'left'\"", "bin = 3", "transitions.next.set.bin", "not of type str"),
-        (SHORT, "bin = \"'left'\"", "bin = \"'up'\"", "transitions.next.set.bin", "left, right"),
+        (
+            SHORT,
+            "bin = \"'left'\"",
+            "bin = \"'up'\"",
+            "transitions.next.set.bin",
+            "write one of \"'left'\", \"'right'\"",
+        ),
         (
             SHORT,
             "bin = \"'left'\"",

@@ -178,6 +178,26 @@ def test_a_rehearsal_has_memory_and_streams_without_a_location_file() -> None:
     assert {(stream, values) for _, stream, values in played.published} == {("place", (4.0,))}
 
 
+def test_a_driver_receives_the_set_points_of_other_actions() -> None:
+    class Scale(Driver):
+        period = 0.02
+
+        def state(self) -> dict[str, float | None]:
+            values = self.ports.stream("weight").values
+            return {"weight": None if values is None else values[0]}
+
+        def step(self, now: float) -> None:
+            """Nothing moves."""
+
+    async def weigh(ctx: Context) -> Result:
+        await ctx.sleep(0.5)
+        return success(weight=ctx.device.state["weight"])
+
+    for points, weight in (({"weight": [1.5]}, 1.5), (None, None)):
+        played = rehearse(weigh, device=Scale({}, None), set_points=points)
+        assert played.result.values == {"weight": weight}
+
+
 def test_a_driver_may_open_a_stream_in_its_setup_and_be_rehearsed_twice() -> None:
     class Desk(Driver):
         def setup(self) -> None:

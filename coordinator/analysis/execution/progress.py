@@ -612,10 +612,9 @@ class Progress:
     def one_run_each(self) -> PropertyVerdict:
         """No action place is entered while it has a run."""
         for place, state in self.x.crowded.items():
-            tokens = self.x.marked(state).get(place, 2)
             details = (
-                f"it holds {tokens} tokens, but can run only once at a time; with `servers = 1` "
-                "the next one waits",
+                "it can run only once at a time; if that may happen, write `servers = 1`: then the "
+                "next one waits",
             )
             return self._no(f"{place} is entered while its run is still there", state, details)
         return self._yes("no action place is entered while its run is there")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
-from petrobot.coordinator.task import Kind, Task
+from petrobot.coordinator.task import Kind, Reference, Task
 from petrobot.coordinator.task.check.completeness import (
     event_faults,
     external_waits,
@@ -131,17 +131,27 @@ def unused(task: Task) -> Iterator[Finding]:
         )
     written = {v for p in places for v in p.out.values()}
     written |= {name for t in task.transitions.values() for name, _ in t.sets}
-    read = {n for t in task.transitions.values() if t.when is not None for n in t.when.names}
+    conditions = {n for t in task.transitions.values() if t.when is not None for n in t.when.names}
     for variable in task.variables.values():
-        if variable.name in read and variable.name not in written and variable.initial is None:
+        name = variable.name
+        if name in written or variable.initial is not None:
+            continue
+        given = [f"places.{p.name}.args" for p in places
+                 if Reference(name) in p.args.values()]  # fmt: skip
+        given += [f"transitions.{t.name}.set" for t in task.transitions.values()
+                  if any(name in value.names for _, value in t.sets)]  # fmt: skip
+        if name in conditions or given:
+            readers, effect = "conditions", "they are false"
+            if given:
+                readers, effect = few(given), f"{name} is none there"
+                readers += " and conditions" * (name in conditions)
+            read = "read" if name in conditions or len(given) > 1 else "reads"
             text = (
-                "conditions read it, but no run writes it and it has no initial value: they are "
-                "false until global memory writes it"
+                f"{readers} {read} it, but no run writes it and it has no initial value: {effect} "
+                "until global memory writes it"
             )
             remedy = "give `initial`, or let a place write it with `out`"
-            yield Finding(
-                Severity.WARNING, "never-written", f"variables.{variable.name}", text, remedy
-            )
+            yield Finding(Severity.WARNING, "never-written", f"variables.{name}", text, remedy)
 
 
 # --- all checks ---

@@ -68,13 +68,21 @@ def code_findings(
         elif text := _called(key, service, services.get(service, {}), given[key]):
             remedy = f"write its parameters as `ctx, *, {listed(given[key])}`"
             yield Finding(Severity.ERROR, "code", f"task.{key}", text, remedy)
+    placed = {p.task: None for p in task.flat.places.values() if p.task}
+    used = dict.fromkeys(
+        a for name in placed for a in task.primitive_tasks[name].alternatives if a in code
+    )
+    # First what the code itself does wrong: what follows may follow from it.
+    actions = [code[action] for action in used]
+    for kind, severity in (("faults", Severity.ERROR), ("doubtful", Severity.WARNING)):
+        found = {tuple(one) for facts in (*actions, *drivers) for one in facts.get(kind, ())}
+        for file, line, text in sorted(found):
+            yield Finding(severity, "code", f"{file}:{line}", text)
     yield from argument_findings(task, code, args)
-    used: dict[str, None] = {}
     for place in task.flat.places.values():
         if place.task:
             primitive = task.primitive_tasks[place.task]
             known = [a for a in primitive.alternatives if a in code]
-            used |= dict.fromkeys(known)
             if known and len(known) == len(primitive.alternatives):
                 yield from _values(place, [code[a] for a in known])
             for action in known:
@@ -86,16 +94,12 @@ def code_findings(
     if code.keys() >= args.keys():
         yield from _never_written(used, code, services.values())
     yield from _unraised(task, code)
+    by_drivers = {*timers, *(name for facts in drivers for name in facts.get("events", ()))}
     for action in used:
-        yield from _events(task, action, code[action])
+        yield from _events(task, action, code[action], by_drivers)
         yield from _unknown_services(code[action], {*services, *args})
     yield from dict.fromkeys(f for action in used for f in _unknown_states(code[action]))
     yield from _undeclared(task, drivers, raised, timers)
-    actions = [code[action] for action in used]
-    for kind, severity in (("faults", Severity.ERROR), ("doubtful", Severity.WARNING)):
-        found = {tuple(one) for facts in (*actions, *drivers) for one in facts.get(kind, ())}
-        for file, line, text in sorted(found):
-            yield Finding(severity, "code", f"{file}:{line}", text)
 
 
 def _unknown_states(facts: Mapping[str, Any]) -> Iterator[Finding]:
@@ -290,8 +294,12 @@ def _values(place: Place, facts: list[Mapping[str, Any]]) -> Iterator[Finding]:
     known = sorted({value for f in facts for value in f["values"]})
     for name, variable in place.out.items():
         if name not in known:
-            text = f"no action of {place.task} returns a value {name!r}{nearest(name, known)}"
+            text = f"no action of {place.task} returns a value {name!r}"
             remedy = f"return it (success({name}=...)), or {variable} is never written"
+            if known:
+                text += f", but {listed(known)}{nearest(name, known)}"
+                meant = variable if variable in known else known[0]
+                remedy = f'write {meant} = "{variable}", or return it (success({name}=...))'
             yield Finding(Severity.ERROR, "code", f"places.{place.name}.out.{name}", text, remedy)
 
 
@@ -384,18 +392,27 @@ def _undeclared(
             yield Finding(severity, "code", place, text, remedy)
 
 
-def _events(task: Task, action: str, facts: Mapping[str, Any]) -> Iterator[Finding]:
-    """Internal events that the action raises and the task does not know as such."""
+def _events(
+    task: Task, action: str, facts: Mapping[str, Any], outside: Collection[str]
+) -> Iterator[Finding]:
+    """Internal events that the action raises and the task does not know as such. `outside`: what
+    drivers and timers raise."""
     raisers = {p.name for p in task.primitive_tasks.values() if action in p.alternatives}
     by = "by = " + " or ".join(f'"{name}"' for name in sorted(raisers))
+    own = f"let the action raise an event of another name, declared with {by}"
     for name, (file, line) in facts.get("events", {}).items():
         event = task.events.get(name)
+        text = f"{action!r} raises the event {name!r}, "
         if event is None:
-            text = f"{action!r} raises the event {name!r}, which the task does not declare"
-            text, remedy = text + nearest(name, task.events), f"declare [events.{name}] {by}"
-        elif event.scope is not Scope.INTERNAL or event.by not in raisers:
-            text = f"{action!r} raises the event {name!r}, but it is declared as another's"
-            remedy = f'write scope = "internal" and {by}'
+            text += f"which the task does not declare{nearest(name, task.events)}"
+            remedy = f"declare [events.{name}] {by}"
+        elif event.scope is not Scope.INTERNAL:
+            text += "which is external: only a driver (`self.ports.raise_event`), a timer or the "
+            text, remedy = text + "operator raises it", own
+            if name not in outside:
+                remedy += f'; or, if only the action raises it, write scope = "internal" and {by}'
+        elif event.by not in raisers:
+            text, remedy = f"{text}which is internal to {event.by}", f"write {by}, or {own}"
         else:
             continue
         yield Finding(Severity.WARNING, "code", f"{file}:{line}", text, remedy)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from petrobot.coordinator.task import Kind, Place, Task
+from petrobot.coordinator.task import Kind, Place, Subnet, Task
 from petrobot.coordinator.task.conditions.language import as_literal
 from petrobot.coordinator.task.wording import Severity
 
@@ -66,9 +66,8 @@ def in_file(task: Task, found: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings about the flat task as findings about its file: what is true of every use of
     a subnet is reported once, with the keys and names that the subnet has there."""
     flat = {_identity(finding): finding for finding in found}
-    uses = dict(_uses(task, "", task.places))
-    times = Counter(uses.values())
-    inside = {known: _in_subnet(task, uses, finding) for known, finding in flat.items()}
+    times = Counter(one.name for one in subnets_of(task).values())
+    inside = {known: _in_subnet(task, finding) for known, finding in flat.items()}
     often = Counter(_identity(finding) for finding in inside.values())
     told = dict[tuple[str, ...], Finding]()
     for known, finding in inside.items():
@@ -83,33 +82,45 @@ def _identity(finding: Finding) -> tuple[str, ...]:
     return finding.severity, finding.code, finding.key, finding.text
 
 
-def _uses(task: Task, prefix: str, places: Mapping[str, Place]) -> Iterator[tuple[str, str]]:
-    """Yield what the names of each use of a subnet begin with in the flat task, and the subnet."""
+def subnets_of(task: Task) -> dict[str, Subnet]:
+    """Return the subnet of each use, by what the names in it begin with in the flat task."""
+    return dict(_uses(task, "", task.places))
+
+
+def _uses(task: Task, prefix: str, places: Mapping[str, Place]) -> Iterator[tuple[str, Subnet]]:
     for place in places.values():
         if place.kind is Kind.MACRO and place.subnet:
-            inner = f"{prefix}{place.name}."
-            yield inner, place.subnet
-            yield from _uses(task, inner, task.subnets[place.subnet].places)
+            inner, subnet = f"{prefix}{place.name}.", task.subnets[place.subnet]
+            yield inner, subnet
+            yield from _uses(task, inner, subnet.places)
 
 
-def _in_subnet(task: Task, uses: Mapping[str, str], finding: Finding) -> Finding:
+def subnet_of(task: Task, name: str) -> tuple[str, Subnet | None]:
+    """Return what an element of the flat task has in front of its name, and the subnet that it is
+    in; nothing for one of the task itself."""
+    uses = subnets_of(task)
+    prefix = max((use for use in uses if name.startswith(use)), key=len, default="")
+    return prefix, uses.get(prefix)
+
+
+def _in_subnet(task: Task, finding: Finding) -> Finding:
     """Return the finding with the names of the subnet that its key is in; the same if in none."""
     table, _, name = finding.key.partition(".")
-    prefix = max((use for use in uses if name.startswith(use)), key=len, default="")
-    if not prefix or table not in ("places", "transitions"):
+    prefix, subnet = subnet_of(task, name)
+    if subnet is None or table not in ("places", "transitions"):
         return finding
-    subnet, rest = uses[prefix], name.removeprefix(prefix)
-    if finding.code == NEVER_MARKED and rest == task.subnets[subnet].entry:
+    rest = name.removeprefix(prefix)
+    if finding.code == NEVER_MARKED and rest == subnet.entry:
         return finding  # not the subnet lacks an arc, but its macro place
 
     def local(text: str) -> str:
         text = re.sub(rf"(?<![\w.]){re.escape(prefix)}", "", text)
-        text = text.replace("[errors] to = ...", f"error = ... in [subnets.{subnet}]")
-        return text.replace("[transitions]", f"[subnets.{subnet}.transitions]")
+        text = text.replace("[errors] to = ...", f"error = ... in [subnets.{subnet.name}]")
+        return text.replace("[transitions]", f"[subnets.{subnet.name}.transitions]")
 
     return replace(
         finding,
-        key=f"subnets.{subnet}.{table}.{rest}",
+        key=f"subnets.{subnet.name}.{table}.{rest}",
         text=local(finding.text),
         remedy=local(finding.remedy),
         witness=finding.witness and {local(n): value for n, value in finding.witness.items()},

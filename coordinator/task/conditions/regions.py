@@ -32,7 +32,7 @@ from petrobot.coordinator.task.conditions.language import (
     walk,
     with_values,
 )
-from petrobot.coordinator.task.wording import nearest
+from petrobot.coordinator.task.wording import few, nearest
 
 LIMIT = 50_000
 """Assignments that are tried before the answer is `UNKNOWN`."""
@@ -254,7 +254,8 @@ def _compare_kinds(node: Compare, domains: Mapping[str, Domain], faults: list[st
             if possible and other.value not in possible:
                 faults.append(
                     f"{side.name!r} is never {as_literal(other.value)} at column "
-                    f"{other.at + 1}{nearest(other.value, possible)}"
+                    f"{other.at + 1}{nearest(other.value, possible)}; it may be "
+                    f"{few([as_literal(value) for value in possible])}"
                 )
 
 
