@@ -397,16 +397,12 @@ def _find_modules_in(folder: Path) -> None:
     """
     found = folder.resolve()
     package = (found / "__init__.py").exists() or found == (SHIPPED / CELL).resolve().parent
-    own = str(found)
-    if package or (own in sys.path and own not in _cells):
+    own, cells = str(found), directory_file.CELLS
+    if package or (own in sys.path and own not in cells):
         return
-    _cells[:] = [own, *(cell for cell in _cells if cell != own)]
-    sys.path[:] = [path for path in sys.path if path not in _cells] + _cells
+    cells[:] = [own, *(cell for cell in cells if cell != own)]
+    sys.path[:] = [path for path in sys.path if path not in cells] + cells
     importlib.invalidate_caches()
-
-
-_cells: list[str] = []
-"""Folders of location files that this process has put on the path, the latest first."""
 
 
 def _import_fault(path: str) -> str:

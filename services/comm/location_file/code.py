@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.services.comm.location_file import MEMORY, Directory
-from petrobot.services.comm.location_file.reading import Faults, nearest
+from petrobot.services.comm.location_file.reading import CELLS, Faults, nearest
 from petrobot.services.comm.protocol.security import is_loopback
 from petrobot.services.host.json_text import json_text
 
@@ -78,7 +78,8 @@ def _ask(paths: list[Any], seconds: float) -> tuple[list[Facts], str]:
     """Return what a new process reports about the paths until it ends, and why it ended before the
     last one. Code that comes with petrobot does not change while this process runs, so it is read
     once."""
-    question = json_text({"parent": os.getpid(), "sys_path": sys.path, "paths": paths})
+    folders = [folder for folder in sys.path if folder not in CELLS[1:]]  # of other cells
+    question = json_text({"parent": os.getpid(), "sys_path": folders, "paths": paths})
     if all(path.startswith("petrobot.") for path, _ in paths):
         return _ask_once(question, seconds)
     return _ask_process(question, seconds)

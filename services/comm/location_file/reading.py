@@ -27,6 +27,10 @@ class KeySpec(NamedTuple):
     required: bool = False
 
 
+CELLS: list[str] = []
+"""Folders of location files that this process has put on Python's path, the latest first."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a hint with the nearest known name, or with all names when there are few."""
     import difflib  # here, because each process of a node reads the file, and few find a fault
@@ -42,7 +46,8 @@ def nearest_in(module: str, name: str, names: Iterable[str]) -> str:
     """Return the same hint for a name that a module does not have. A package, an installed module
     or Python's own hides one of the user that has its name."""
     near = nearest(name, names)
-    files, spec = (Path(f, f"{module}.py") for f in sys.path), PathFinder.find_spec(module)
+    folders = (folder for folder in sys.path if folder not in CELLS[1:])
+    files, spec = (Path(f, f"{module}.py") for f in folders), PathFinder.find_spec(module)
     *_, own = None, *(file for file in files if file.is_file())  # the user's folder is the last
     if own and spec and spec.origin and not own.samefile(spec.origin):
         return f"; {spec.origin} hides {own}: give yours another name"
