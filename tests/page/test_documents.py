@@ -380,7 +380,7 @@ async def pick(ctx, *, force):
 async def put(ctx):
     return success()
 async def clear(ctx):
-    await ctx.raise_event("part_there")
+    ctx.raise_event("part_there")
     return success()
 """
 
