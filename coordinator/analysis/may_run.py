@@ -203,15 +203,18 @@ def _left_running(task: Task, analysis: Analysis) -> Iterator[Finding]:
     there, on the way to what speaks against the task: nothing expects that run any more."""
     if analysis.progress is None:
         return
-    x, told = analysis.progress.x, set[str]()
-    net = x.engine.compiled.net
+    x, net = analysis.progress.x, analysis.progress.x.engine.compiled.net
+    beside, told = dict[str, list[str]](), set[str]()
     for verdict in analysis.objections.values():
         witness = verdict.witness
         names = witness.firings if witness and witness.steps else ()
         for name, marking in zip(names, [*net.replay(names)][1:], strict=True):
             t = task.flat.transitions[name]
-            left = [p for p in _beside(task, t) if marking[net.place_index[p]]]
-            left = [p for p in left if p in x.crowded or _leads_on(task.flat, p)]
+            if name not in beside:
+                beside[name] = [
+                    p for p in _beside(task, t) if p in x.crowded or _leads_on(task.flat, p)
+                ]
+            left = [p for p in beside[name] if marking[net.place_index[p]]]
             if left and name not in told:
                 told.add(name)
                 yield from _each_use(task, t, left)
@@ -219,7 +222,7 @@ def _left_running(task: Task, analysis: Analysis) -> Iterator[Finding]:
 
 def _leads_on(flat: Task, place: str) -> bool:
     """Return whether a good end of a place's run moves a token on. One that only takes it away lets
-    the run go on beside the rest, as is meant."""
+    the run continue beside the others, as is meant."""
     outputs = (o.place for t in flat.exits.get((place, End.NORMAL), ()) for o in t.outputs)
     return any(flat.places[name].kind is not Kind.RESOURCE for name in outputs)
 
@@ -240,7 +243,7 @@ def _beside(task: Task, t: Transition) -> list[str]:
 
 
 def _is_added(t: Transition) -> bool:
-    """Return whether it is an error exit that nobody wrote, or a copy of one for `tries`."""
+    """Return whether it is an error exit that was added, or a copy of one for `tries`."""
     return bool(t.expanded_from) and t.name.startswith(f"{t.expanded_from}.error")
 
 
@@ -332,8 +335,9 @@ def _awaited_ends(task: Task, x: ExecutionGraph) -> Iterator[Finding]:
     waits[x.source[outside[x.label] & ~x.by_hand]] = True
     waits[x.source[~outside[x.label] & ~x.by_hand]] = False
     found = dict[str, None]()
-    for i in np.flatnonzero(waits & ~x.final).tolist() if task.final != flat.final else ():
-        tokens = dict(zip(places, x.states[i].marking, strict=True))
+    waiting = np.flatnonzero(waits & ~x.final).tolist() if task.final != flat.final else ()
+    for marking in {x.states[i].marking: None for i in waiting}:
+        tokens = dict(zip(places, marking, strict=True))
         if task.final.holds(tokens):
             own = (flat.places[name] for name in tokens if tokens[name])
             found |= {p.name: None for p in own if p.kind is Kind.PLAIN and not p.listen

@@ -327,7 +327,7 @@ def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = Tr
     present = draft.tokens.get(arc.name)
     if not present:
         return []
-    # Most runs of a crowded place wait in a queue: those are told apart here, without a call.
+    # Most runs of a crowded place wait in a queue: this leaves them out without a call.
     done, active = Phase.DONE, arc.end is End.PREEMPT or arc.end is End.GOING
     runs = [
         r

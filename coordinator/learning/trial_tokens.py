@@ -37,6 +37,10 @@ class TrialTokens:
         resources = {p.name for p in flat.places.values() if p.kind is Kind.RESOURCE}
         self._settled = self._sinks | self._listening | {net.place_index[p] for p in resources}
         """Places where a token of no trial keeps no trial from its end, as in `final`."""
+        stocks = {p.name for p in flat.places.values() if p.kind is Kind.CONTROL}
+        filled = {p for arcs in net.produce for p, _ in arcs}
+        self._lent = {p for p in filled - {self._runs_place} if net.places[p] not in stocks}
+        """Places whose tokens come back. Those of a stock, such as screws, are used up."""
         self._free = [*net.initial]
         """By place: its tokens of no trial."""
         self._waiting: defaultdict[int, deque[int]] = defaultdict(deque)
@@ -86,7 +90,7 @@ class TrialTokens:
                 trials += [*self._waiting[place]][:1]
         for place, weight in consumed.items():
             for _ in range(weight):
-                owed = place != own and self._free[place] <= self._net.initial[place]
+                owed = place in self._lent and self._free[place] <= self._net.initial[place]
                 trial = self._take(place, fired.runs)
                 if trial != NOBODY:
                     trials.append(trial)

@@ -339,3 +339,14 @@ def test_a_branch_beside_the_work_leaves_every_trial_its_end(
     judged = [r for r in selector.records if isinstance(r, Credit) and r.primitive_task == "serve"]
     assert [r.outcome.status is Status.SUCCESS for r in judged].count(False) == 4
     assert len(judged) == 20
+
+
+def test_a_trial_that_uses_up_a_stock_has_its_end() -> None:
+    """What it took never comes back, so nothing waits for it."""
+    text = PIPE.replace('in = ["rack"]', 'in = ["rack", "screws*2"]').replace(
+        "broken = {}", 'broken = {}\nscrews = { kind = "control", tokens = 99 }'
+    )
+    trials, _ = played(loads(text, "pipe.toml"), 12, {"load": [run(0.5)], "weigh": [run(0.7)]})
+    assert len(trials) == 12
+    for trial in trials:
+        assert trial.time == pytest.approx(trial.runs[1].begun + trial.runs[1].took)

@@ -147,7 +147,7 @@ class Credentials:
 def _not_accepted(server: ssl.SSLContext, client: ssl.SSLContext, party: str) -> str:
     """Return why the rest of the cell will not accept the certificate of `party`, found by a
     handshake with itself in memory; empty if it will, once its time has come or it is renewed.
-    Without this a node that nobody can reach would count as ready."""
+    Without this, `up` would call a node ready that refuses every connection."""
     import ssl
 
     asked, answered = ssl.MemoryBIO(), ssl.MemoryBIO()
