@@ -67,7 +67,7 @@ async def test_an_invalid_task_is_refused_with_its_fault() -> None:
 def test_a_search_that_ran_out_of_states_leaves_verdicts_unknown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(10))
+    monkeypatch.setattr("petrobot.coordinator.analysis.may_run.BUDGET", Budget(10, 1000))
     answer = next(analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml"))
     assert answer["complete"] is False
     assert None in {verdict["holds"] for verdict in answer["verdicts"]}

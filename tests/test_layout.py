@@ -205,6 +205,16 @@ def test_no_module_imports_what_its_room_may_not_know() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+def test_only_one_module_imports_pybullet() -> None:
+    """All others run where there is no wheel of it."""
+    found = [
+        name
+        for name, path, nodes in parsed()
+        if any(target.startswith("pybullet") for _, target in imports(name, path, nodes))
+    ]
+    assert found == ["sim.catching.bullet"]
+
+
 def test_pure_rooms_stay_pure_and_nothing_is_unpickled() -> None:
     """No module loads code from data; pure rooms have no socket, process or randomness."""
     wrong = []

@@ -62,9 +62,9 @@ def _cross(a: Array, b: Array) -> bool:
     return bool((over_a & (_side(b0, b1, a0) * _side(b0, b1, a1) < 0)).any())
 
 
-def inside(p: Point, box: Box, margin: float = 0.0) -> bool:
+def inside(p: Point, box: Box) -> bool:
     """Return whether a point lies in a box."""
-    return box[0] - margin < p[0] < box[2] + margin and box[1] - margin < p[1] < box[3] + margin
+    return box[0] < p[0] < box[2] and box[1] < p[1] < box[3]
 
 
 def box_of(node: DrawnNode) -> Box:
@@ -80,14 +80,20 @@ def covers(a: Box, b: Box) -> bool:
 
 def through_nodes(scene: Scene, ways: list[ArcPath]) -> Iterator[tuple[ArcPath, str]]:
     """Yield the arcs that cross a node which is not one of their ends."""
+    boxes = [(node.name, box_of(node)) for node in scene.nodes.values()]
     for way in ways:
         n = 200 * len(way.controls)
-        dense = [way.point(i / n) for i in range(n + 1)]  # an own measure: `points` may miss a bar
-        for node in scene.nodes.values():
-            if node.name not in (way.arc.source, way.arc.target) and any(
-                inside(p, box_of(node), 1.0) for p in dense
+        # an own measure: `points` may miss a bar
+        dense = np.array([way.point(i / n) for i in range(n + 1)])
+        low, high = dense.min(0), dense.max(0)
+        for name, box in boxes:
+            if name in (way.arc.source, way.arc.target) or not covers(
+                (*low, *high), (box[0] - 1, box[1] - 1, box[2] + 1, box[3] + 1)
             ):
-                yield way, node.name
+                continue
+            within = (dense > np.array(box[:2]) - 1) & (dense < np.array(box[2:]) + 1)
+            if within.all(1).any():
+                yield way, name
 
 
 def through_words(words: list[LabelBox], ways: list[ArcPath]) -> int:

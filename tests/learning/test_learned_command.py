@@ -91,7 +91,7 @@ def _uses_the_measurements(file: str, capsys: pytest.CaptureFixture[str]) -> Non
     sources = json.loads(capsys.readouterr().out)["forecast"]["sources"]
     assert any(text.startswith("measured in") and "in missions" in text for text in sources)
     for command in (
-        ["simulate", task, *more, "--replicas", "20", "--json", "-"],
+        ["simulate", task, *more, "--replicas", "2", "--json", "-"],
         ["show", task, *more, "--heat"],
         ["show", task, *more, "--view", "gspn"],
         ["convert", task, "learned.pnpro", *more],

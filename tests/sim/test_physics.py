@@ -22,7 +22,6 @@ from petrobot.sim.catching.laboratory import make_laboratory
 from petrobot.sim.catching.physics import BULLET, PORTABLE, PORTABLE_VERSION, choose, version
 from petrobot.sim.catching.truth import LABORATORY_FILE, LaboratoryError
 from tests.sim.conftest import needs_bullet
-from tests.test_layout import imports, parsed
 
 ROOT = Path(__file__).parents[2]
 NOW = f"portable {PORTABLE_VERSION}"
@@ -107,16 +106,6 @@ def test_bullet_reports_the_installed_version() -> None:
 def test_old_records_count_as_bullets() -> None:
     assert same_physics("", FIRST_PHYSICS) and same_physics("", "") and same_physics(NOW, NOW)
     assert not same_physics("", NOW) and not same_physics(NOW, FIRST_PHYSICS)
-
-
-@pytest.mark.once
-def test_only_one_module_imports_pybullet() -> None:
-    found = [
-        name
-        for name, path, nodes in parsed()
-        if any(target.startswith("pybullet") for _, target in imports(name, path, nodes))
-    ]
-    assert found == ["sim.catching.bullet"]
 
 
 @pytest.mark.processes
