@@ -84,12 +84,9 @@ def match(
         return None
     if x.after is not None and not ((timer := draft.timers.get(x.name)) and timer.elapsed):
         return None
-    eligible: list[list[Run]] = []
-    for arc in x.actions:
-        runs = eligible_runs(draft, arc, claims)
-        if len(runs) < arc.weight:
-            return None
-        eligible.append(runs)
+    eligible = _eligible(draft, x, claims)
+    if eligible is None:
+        return None
     for selection in _selections(x, eligible):
         if x.when is None or _condition_holds(draft, x, selection):
             return Match(x, selection)
@@ -101,8 +98,8 @@ def arcs_satisfied(draft: Draft, x: CompiledTransition) -> tuple[Run, ...] | Non
     are not satisfied."""
     if not _marking_allows(draft, x, _NOTHING):
         return None
-    eligible = [eligible_runs(draft, arc, _NOTHING, heard=False) for arc in x.actions]
-    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+    eligible = _eligible(draft, x, _NOTHING, heard=False)
+    if eligible is None:
         return None
     return tuple(
         r for arc, runs in zip(x.actions, eligible, strict=True) for r in runs[: arc.weight]
@@ -122,8 +119,8 @@ def awaited_place(draft: Draft, x: CompiledTransition, among: Collection[int]) -
         return None
     if any(flag not in draft.flags for flag in x.flags):
         return None
-    eligible = [eligible_runs(draft, arc, _NOTHING) for arc in x.actions]
-    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+    eligible = _eligible(draft, x, _NOTHING)
+    if eligible is None:
         return None
     ready = x.when is None or any(
         _condition_holds(draft, x, runs, tell=False) for runs in _selections(x, eligible)
@@ -142,8 +139,8 @@ def can_still_fire(draft: Draft, x: CompiledTransition) -> bool:
     when an external event comes or the global memory changes a variable."""
     if x.never or not _marking_allows(draft, x, _NOTHING):
         return False
-    eligible = [eligible_runs(draft, arc, _NOTHING) for arc in x.actions]
-    if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
+    eligible = _eligible(draft, x, _NOTHING)
+    if eligible is None:
         return False
     return any(_condition_can_hold(draft, x, runs) for runs in _selections(x, eligible))
 
@@ -319,6 +316,19 @@ def _tokens(place: str, wanted: int, held: int) -> str:
     if wanted == 1:
         return f"{place}, which is empty"
     return f"{wanted} of {place}, which holds {held}"
+
+
+def _eligible(
+    draft: Draft, x: CompiledTransition, claims: Claims, heard: bool = True
+) -> list[list[Run]] | None:
+    """Return the `eligible_runs` of each arc from an action place; None if an arc has too few."""
+    found: list[list[Run]] = []
+    for arc in x.actions:
+        runs = eligible_runs(draft, arc, claims, heard)
+        if len(runs) < arc.weight:
+            return None
+        found.append(runs)
+    return found
 
 
 def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
