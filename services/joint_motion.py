@@ -95,7 +95,7 @@ class Axis(Driver):
         self.at += self.velocity * dt
         there = self.goal is not None and abs(self.goal - self.at) < 1e-9
         if self.goal is not None and there and abs(self.velocity) <= change + 1e-9:
-            self.at, self.velocity = self.goal, 0.0
+            self.at = self.goal  # the velocity is 0 from the next period on
 
     def state(self) -> Mapping[str, Any]:
         """Where it is (m), how fast (m/s), and whether it has arrived at the goal."""

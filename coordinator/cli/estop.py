@@ -96,12 +96,15 @@ def _address(options: argparse.Namespace) -> RunAddress | None:
 def _cells(
     options: argparse.Namespace, path: Path | None, address: RunAddress | None
 ) -> tuple[Directory, Directory | None]:
-    """Return the cell of services.toml, and what it was when the active run began, if it was edited
-    since (to clear a stop: when the newest run began).
+    """Return the cell of services.toml, and what it was when the active run began, or the newest
+    one whose coordinator was killed, if it was edited since (to clear a stop: when the newest run
+    began).
 
     A file that was edited into one that cannot be read, or removed, keeps no stop from the nodes:
     the newest run's is taken."""
-    begun = _begun(address.run if address is not None else options.run or "last", options.journal)
+    begun, ended = _begun(
+        address.run if address is not None else options.run or "last", options.journal
+    )
     if path is None and begun is not None and not Path("services.toml").exists():
         path = begun.source if begun.source.parent == Path.cwd() else None
     own = begun is not None and begun.source.resolve() == services_path(path).resolve()
@@ -113,22 +116,24 @@ def _cells(
         print(f"{fault}\nmeant is the cell as the newest run here began with it", file=sys.stderr)
         return begun, None
     edited = begun is not None and own and begun.hash != directory.hash
-    return directory, begun if edited and (address is not None or options.clear) else None
+    return directory, begun if edited and (options.clear or not ended) else None
 
 
-def _begun(run: str, folder: Path) -> Directory | None:
-    """Return the cell that a run began with; None without such a run in real time."""
-    from petrobot.coordinator.run.folder import NoRunError, journal_of
+def _begun(run: str, folder: Path) -> tuple[Directory | None, bool]:
+    """Return the cell that a run began with, None without such a run in real time, and whether that
+    run has ended: nodes of one whose coordinator was killed may still move their devices."""
+    from petrobot.coordinator.run.folder import RESULT, NoRunError, journal_of
     from petrobot.coordinator.run.journal import JournalError, read_header
     from petrobot.services.comm.location_file import DirectoryError, parse
 
     try:
-        then = read_header(journal_of(run, folder))
+        then = read_header(path := journal_of(run, folder))
         if then["mode"] == "realtime":
-            return parse(then["services"], Path(then["services_path"]))
+            cell = parse(then["services"], Path(then["services_path"]))
+            return cell, path.with_name(RESULT).exists()
     except (NoRunError, JournalError, DirectoryError, OSError, LookupError, ValueError):
         pass
-    return None
+    return None, True
 
 
 async def _tell(address: RunAddress, folder: Path) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.services.host.command_line import whole
+from petrobot.services.host.command_line import whole, write_in_thread
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.start_from import Recorded
@@ -134,7 +134,9 @@ class _StandardError(logging.Handler):
 
 
 def log_to_stderr(level: str) -> None:
-    """Log the records of this level and above to standard error."""
+    """Log the records of this level and above to standard error. A terminal that is stopped
+    (Ctrl-S) or hangs must not stop a mission, so nothing waits for it."""
+    write_in_thread("stderr")
     logger = logging.getLogger("petrobot")
     logger.setLevel(level.upper())
     if not any(isinstance(handler, _StandardError) for handler in logger.handlers):

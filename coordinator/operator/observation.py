@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from base64 import b64encode
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from math import isfinite
 from typing import Any, Protocol
 
@@ -21,7 +22,7 @@ from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import costs
 from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.table import TrialRow
-from petrobot.coordinator.studies.campaign.trials import TrialLog
+from petrobot.coordinator.studies.campaign.trials import Trial, TrialLog
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Command, Feedback
@@ -57,6 +58,10 @@ def shown_alternatives(task: Task, selector: FirstAlternative, name: str) -> lis
     return [{"action": a, **figures.get(a, {})} for a in task.primitive_tasks[name].alternatives]
 
 
+VERDICT_WITHIN = 100
+"""Trials after which a provisional status counts although its verdict has not come."""
+RUNS_KEPT = 10_000
+"""Most runs of trials that are not over."""
 TASK_REPORT = "the whole task"
 """Name of the report about R, C and J of the task."""
 
@@ -68,18 +73,60 @@ class TrialWatch(TrialLog):
     def __init__(self, task: Task, directory: Directory, feed: Feed) -> None:
         super().__init__(task, costs(task, directory))
         self._task, self._feed, self._shown = task, feed, 0
+        self._counted = Summary(task)
+        """The trials that are not kept any more: no run of them can change."""
+        self._counted.drawn.add("")  # a run has one seed: nothing is compared
+        self._full = False
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Record what the trials need of a stimulus."""
+        if not self._full:
+            super().stimulus(now, stimulus)
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Record what belongs to a trial, unless it has too many runs."""
+        if not self._full:
+            super().instruction(now, instruction)
 
     def settled(self, now: float, state: State) -> None:
-        """Show the figures after each trial, or with many trials after each
-        further 2 %, since all are counted again (a verdict may come late)."""
+        """Show the figures after each trial, or with many trials after each further 2 %. Count a
+        trial when it can no longer change: what is kept must not grow with the run, and all trials
+        counted anew would stop this process for seconds."""
+        if self._full:
+            return
         over = state.mode is Mode.FINISHED
         done = [trial for trial in self.trials if trial.completed or over]
-        if len(done) >= self._shown + max(1, self._shown // 50) or (over and len(done) > 0):
-            self._shown = len(done)
-            rows = [TrialRow(t.k, "", 0, t.k, 0, 0.0, t) for t in done]
-            found = Summary.of(self._task, rows)
-            report = {"kind": "text", "title": "The task so far", "text": task_text(found)}
-            self._feed.emit("report", name=TASK_REPORT, report=report)
+        for trial in done:
+            late = trial.k + VERDICT_WITHIN < self.tokens.begun
+            if not over and self._may_leave(trial) and (late or all(r.judged for r in trial.runs)):
+                self._counted.add(self._row(trial))
+                self.forget(trial)
+        done = [trial for trial in done if trial.k in self._trials]
+        count = self._counted.whole.runs + len(done)
+        if count >= self._shown + max(1, self._shown // 50) or (over and count > 0):
+            self._shown = count
+            found = deepcopy(self._counted, {id(self._task): self._task}) if done else self._counted
+            for trial in done:
+                found.add(self._row(trial))
+            self._show(task_text(found))
+        if len(self._entries) > RUNS_KEPT:
+            self._full = True
+            self._show(
+                f"not counted any more: trials with more than {RUNS_KEPT:,} runs are not over"
+            )
+            self._trials, self._entries, self._ends = {}, {}, {}
+
+    def _may_leave(self, trial: Trial) -> bool:
+        """Return whether nothing that is still to come belongs to a trial."""
+        return trial.time is not None and trial.k < self.tokens.begun and self.recorded(trial)
+
+    @staticmethod
+    def _row(trial: Trial) -> TrialRow:
+        return TrialRow(trial.k, "", 0, trial.k, 0, 0.0, trial)
+
+    def _show(self, text: str) -> None:
+        report = {"kind": "text", "title": "The task so far", "text": text}
+        self._feed.emit("report", name=TASK_REPORT, report=report)
 
 
 def task_text(found: Summary) -> str:

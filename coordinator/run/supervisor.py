@@ -20,6 +20,8 @@ from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
+from petrobot.coordinator.run.journal import JournalError
+from petrobot.coordinator.run.realtime import on_disk
 from petrobot.services.host.whole_file import make_folder
 
 _log = logging.getLogger(__package__)
@@ -327,7 +329,8 @@ async def _copy(child: _Child, output: asyncio.StreamReader, log: FileIO) -> Non
     # the pipe would fill and block each later action that prints.
     while part := await output.read(1 << 16):
         try:
-            log.write(part)
+            with contextlib.suppress(JournalError):  # the disk hangs: what it was given is lost
+                await on_disk(functools.partial(log.write, part))
         except OSError as fault:
             if not child.ready.is_set():
                 child.log_fault = child.log_fault or OSError(

@@ -7,10 +7,11 @@ raised here is printed as it is: `argument --runs: abc is not a whole number of 
 
 from __future__ import annotations
 
-import errno
+import atexit
 import io
 import logging
 import os
+import signal
 import sys
 import threading
 import time
@@ -23,6 +24,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from argparse import ArgumentParser, ArgumentTypeError
 
+OUTPUT_KEPT = 1 << 20
+"""Bytes of output that wait for a disk or a terminal; more are lost."""
+OUTPUT_WAIT, LAST_OUTPUT = 0.02, 1.0
+"""How long a process waits for its output to be written, and at its end (s)."""
 LOG_LEVELS = {
     "debug": logging.DEBUG,
     "info": logging.INFO,
@@ -42,17 +47,85 @@ def add_log_level(parser: ArgumentParser) -> None:
     )
 
 
-class _LogFile(io.FileIO):
-    """The file of standard error. What finds no room on its disk is lost: a driver that prints must
-    not end because of that."""
+class _Output(io.RawIOBase):
+    """The file of a standard stream, written in a thread: a hung disk, a stopped terminal (Ctrl-S)
+    or a pipe that is not read must stop neither a driver nor an event loop. What finds no room is
+    lost: a driver that prints must not end because of that."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+        self._begin()
+        atexit.register(self._drain, LAST_OUTPUT)
+
+    def _begin(self) -> None:
+        self._process = os.getpid()
+        self._turn = threading.Condition()
+        self._waiting = bytearray()
+        self._writing = self._late = False
+        self._lost = 0
+        self._thread: threading.Thread | None = None
+
+    def fileno(self) -> int:
+        return self._number
+
+    def isatty(self) -> bool:
+        return os.isatty(self._number)
+
+    def writable(self) -> bool:
+        return True
 
     def write(self, data: Any, /) -> int:
-        try:
-            return super().write(data)
-        except OSError as fault:
-            if fault.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                raise
-            return len(data)
+        if self._process != os.getpid():
+            self._begin()  # a fork has no copy of the thread
+        given = bytes(data)
+        with self._turn:
+            if self._waiting and len(self._waiting) + len(given) > OUTPUT_KEPT:
+                self._lost += len(given)
+                return len(given)
+            self._waiting += given
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._write_all, daemon=True)
+                self._thread.start()
+            self._turn.notify_all()
+        # So nothing is lost if this process crashes next. An output that was late is not waited for
+        # again until all has been written.
+        if not self._late:
+            self._drain(OUTPUT_WAIT)
+        return len(given)
+
+    def _drain(self, limit: float) -> None:
+        with self._turn:
+            self._late = not self._turn.wait_for(
+                lambda: not self._waiting and not self._writing, limit
+            )
+
+    def _write_all(self) -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # for the main thread
+        while True:
+            with self._turn:
+                self._writing = False
+                if not self._waiting:
+                    self._late = False
+                    self._turn.notify_all()
+                    self._turn.wait_for(lambda: self._waiting)
+                data, self._waiting, self._writing = self._waiting, bytearray(), True
+                if self._lost:
+                    data += f"({self._lost} bytes of output found no room and are lost)\n".encode()
+                    self._lost = 0
+            with suppress(OSError):
+                while data:
+                    del data[: os.write(self._number, data)]
+
+
+def write_in_thread(*names: str) -> None:
+    """Make these standard streams of this process wait for no disk and no terminal, and raise no
+    error if there is no room."""
+    for name in names:
+        stream = getattr(sys, f"__{name}__")
+        if stream is not None and getattr(sys, name) is stream:
+            file = io.BufferedWriter(_Output(stream.fileno()))
+            kept = {"line_buffering": stream.line_buffering, "write_through": stream.write_through}
+            setattr(sys, name, io.TextIOWrapper(file, stream.encoding, stream.errors, **kept))
 
 
 def add_member_options(parser: ArgumentParser) -> None:
@@ -72,11 +145,8 @@ def add_member_options(parser: ArgumentParser) -> None:
 
 def log_to_stderr(level: int = logging.INFO) -> None:
     """Write log records of this level and above to the process's standard error, which is its
-    node's log. From now on a full disk raises no error there."""
-    stream = sys.__stderr__
-    if stream is not None and sys.stderr is stream:
-        file = io.BufferedWriter(_LogFile(stream.fileno(), "w", closefd=False))
-        sys.stderr = io.TextIOWrapper(file, stream.encoding, stream.errors, line_buffering=True)
+    node's log. From now on no print waits for the disk, and a full one raises no error."""
+    write_in_thread("stdout", "stderr")
     logging.basicConfig(
         format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=level
     )

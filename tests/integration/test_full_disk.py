@@ -1,14 +1,17 @@
 """A disk that becomes full, or a journal that is taken away, during a run: one clear error, no
-effect without a record, and a resume that ends the run."""
+effect without a record, and a resume that ends the run. And a terminal that takes no output."""
 
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
+from subprocess import DEVNULL
 
 import pytest
 
@@ -111,3 +114,24 @@ def test_a_run_whose_journal_is_taken_away_ends_and_resumes_when_it_is_back(tmp_
         up.wait(PATIENCE)
     assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
     assert set(moves(tmp_path, "begin").values()) == {1} and not moves(tmp_path, "overlap")
+
+
+def test_a_stopped_terminal_does_not_stop_the_mission(tmp_path: Path) -> None:
+    """Ctrl-S: each write to the terminal waits until Ctrl-Q."""
+    shuttle_services(tmp_path, fetch=0.2, carry=0.2, orphan=60.0)
+    given = ["run", str(TASK), "--runs", str(RUNS), "--services", str(tmp_path / "services.toml")]
+    command = [sys.executable, "-m", "petrobot.coordinator", *given, "--journal", "runs"]
+    reader, terminal = os.openpty()
+    termios.tcflow(terminal, termios.TCOOFF)
+    up = nodes(tmp_path)
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=DEVNULL, stderr=terminal)
+    try:
+        assert run.wait(PATIENCE) == 0
+    finally:
+        run.kill()
+        up.terminate()
+        up.wait(PATIENCE)
+        os.close(reader)
+        os.close(terminal)
+    assert len(ends_of(tmp_path)) == RUNS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -192,10 +193,19 @@ alone = {{ run = "loud:shout", node = "left" }}
 """
 
 
+@pytest.mark.parametrize("hangs", [False, True], ids=["full", "hangs"])
 @pytest.mark.processes
-async def test_a_log_on_a_full_disk_ends_no_driver_and_no_action(tmp_path: Path) -> None:
+async def test_a_log_on_a_disk_that_is_full_or_hangs_ends_no_driver_and_no_action(
+    tmp_path: Path, hangs: bool
+) -> None:
+    """A pipe that nobody reads stands for a hung disk: each write to it waits for ever."""
     (tmp_path / "loud.py").write_text(LOUD)
-    (tmp_path / "left.log").symlink_to("/dev/full")
+    log, opened = tmp_path / "left.log", -1
+    if hangs:
+        os.mkfifo(log)
+        opened = os.open(log, os.O_RDWR)
+    else:
+        log.symlink_to("/dev/full")
     file = tmp_path / "services.toml"
     file.write_text(LOUD_CELL.format(port=free_ports(1)[0]))
     node = start_node("left", file)
@@ -206,9 +216,12 @@ async def test_a_log_on_a_full_disk_ends_no_driver_and_no_action(tmp_path: Path)
                 assert (await operator.call(action)).status == "success", action
             status = await operator.command("left", "status", "loud")
             assert status.data["devices"]["loud"]["restarts"] == 0
+            assert (await operator.command("left", "emergency_stop")).ok
     finally:
         node.terminate()
         node.communicate(timeout=PATIENCE)
+        if hangs:
+            os.close(opened)
     assert node.returncode == 0
 
 

@@ -7,7 +7,10 @@ import asyncio
 import os
 import signal
 import sys
+import threading
+from io import FileIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -175,6 +178,26 @@ async def test_a_long_line_does_not_end_the_copying_of_what_a_program_prints(
     said = "print('x' * (1 << 20), flush=True); " * 2
     async with Supervisor([program("a", f"{said}{STEADY}")], tmp_path):  # until it is ready
         assert (tmp_path / "a.log").stat().st_size > 2 << 20
+
+
+async def test_a_log_whose_disk_hangs_stops_no_event_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The supervisor of `run --up` shares its loop with the mission."""
+    answers, hung = threading.Event(), threading.Event()
+
+    class Hung(FileIO):
+        def write(self, data: Any, /) -> int:
+            if b"line" in data:
+                hung.set()
+                assert answers.wait(60.0)
+            return super().write(data)
+
+    monkeypatch.setattr(supervisor, "FileIO", Hung)
+    async with Supervisor([program("a", TALKING)], tmp_path):
+        await until(hung.is_set, "a write that hangs")
+        answers.set()
+        await until(lambda: b"line " in (tmp_path / "a.log").read_bytes(), "what it wrote then")
 
 
 @pytest.fixture

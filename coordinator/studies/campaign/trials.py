@@ -151,7 +151,10 @@ class TrialLog:
         self._waits = EventWaits(task)
         self._ended_waits: list[Waited] = []
         """Waits that ended before the first trial began."""
-        self.trials: list[Trial] = []
+        self._trials: dict[int, Trial] = {}
+        """The trials that are kept, by number."""
+        self._latest = 0
+        """Number of the latest trial; 0: none has begun."""
         self._open: list[Trial] = []
         """Trials that are not completed yet."""
         # By place: when its latest token entered. A transition is enabled from the latest of these
@@ -165,6 +168,22 @@ class TrialLog:
         self._given_up: str | None = None
         """Why the mission run ended before all its trials completed, if it did."""
         self._origin: float | None = None
+
+    @property
+    def trials(self) -> list[Trial]:
+        """The trials that are kept."""
+        return list(self._trials.values())
+
+    def forget(self, trial: Trial) -> None:
+        """Keep a completed trial no longer."""
+        del self._trials[trial.k], self._ends[trial.k]
+        self._entries = {
+            run: known for run, known in self._entries.items() if known[0] is not trial
+        }
+
+    def recorded(self, trial: Trial) -> bool:
+        """Return whether every run of a trial is recorded."""
+        return len(self._ends.setdefault(trial.k, [])) == len(trial.runs)
 
     # --- an observer --------------------------------------------------------------------------
 
@@ -205,21 +224,22 @@ class TrialLog:
 
     def _begin(self, now: float) -> None:
         """Begin a trial if a token has left the runs place."""
-        if len(self.trials) == self.tokens.begun:
+        if self.tokens.begun == self._latest:
             return
         for trial in self._open:
             trial.completed |= not self.tokens.on_its_way(trial.k)
-        if self.trials:
+        if self._latest:
             self._note_waits(self._waits.cut(now))
         assert self._origin is not None
-        self.trials.append(Trial(len(self.trials) + 1, round(now - self._origin, DIGITS)))
-        self._open = [*(trial for trial in self._open if not trial.completed), self.trials[-1]]
+        self._latest += 1
+        trial = self._trials[self._latest] = Trial(self._latest, round(now - self._origin, DIGITS))
+        self._open = [*(trial for trial in self._open if not trial.completed), trial]
 
     def _note_waits(self, ended: list[Waited]) -> None:
         """Note waits in the latest trial, those from before the first one in the first one."""
         self._ended_waits += ended
-        if self.trials:
-            self.trials[-1].waits += self._ended_waits
+        if self._latest:
+            self._trials[self._latest].waits += self._ended_waits
             self._ended_waits = []
 
     def _fired(self, now: float, fired: Fired) -> None:
@@ -231,10 +251,10 @@ class TrialLog:
                 self._entries[run][1].taken = fired.transition
                 if run in self._active:  # preempted
                     self._ended(now, run)
-        if not self.trials:
+        if not self._latest:
             self._note_waits([] if wait is None else [wait])
             return
-        trial = self.trials[number - 1]
+        trial = self._trials.get(number) or self._trials[self._latest]
         trial.waits += self._ended_waits + ([] if wait is None else [wait])
         self._ended_waits = []
         trial.goals += fired.transition in self._goals
@@ -248,8 +268,8 @@ class TrialLog:
             if after > before:
                 self._since[name] = now
         for k in self.tokens.back:
-            back = self.trials[k - 1]
-            if back.time is None:
+            back = self._trials.get(k)
+            if back is not None and back.time is None:
                 back.completed, back.time = True, self._span(now, back)
 
     def _span(self, now: float, trial: Trial) -> float:
@@ -257,7 +277,7 @@ class TrialLog:
         return round(now - self._origin - trial.begun, DIGITS) + 0.0  # no -0.0
 
     def _entry(self, now: float, start: StartRun) -> RunEntry:
-        trial = self.trials[self.tokens.of(start.run) - 1] if self.trials else None
+        trial = self._trials.get(self.tokens.of(start.run))
         came = self._since[start.place]
         begun = self._span(came, trial) if trial else 0.0
         entry = RunEntry(start.place, start.action, begun, waited=round(now - came, DIGITS))
@@ -319,16 +339,16 @@ class TrialLog:
             trial.status, trial.cause = Status.ERROR.value, trial.cause or self._given_up
 
     def _finished(self, now: float, finished: Finished) -> None:
-        if not self.trials:
+        if not self._latest:
             return
         lost = self.tokens.lost(finished)
         for trial in self.trials:
             met = bool(trial.goals) and trial.k not in lost
             trial.completed |= finished.status is Status.SUCCESS or met
-        last = self.trials[-1]
+        last = self._trials[self._latest]
         if last.completed and last.time is None:
             last.time = self._span(now, last)
-        self.trials = [t for t in self.trials if t.completed or t.k in lost]
+        self._trials = {t.k: t for t in self.trials if t.completed or t.k in lost}
         if finished.status is not Status.SUCCESS:
             self._given_up = finished.reason
             for trial in self.trials:
