@@ -483,7 +483,7 @@ class Analysis:
             f"{'with few phases: ' if told else head}P_complete {done.probability:.9f}, {goal}"
             f"R_conj {f.conjunctive_reliability:.6f}",
             time if done.probability else never,
-            *([f"  one trial: {_figures(f.one_trial.told)}"] if several else []),
+            *([f"  one trial: {_figures(f.one_trial.told)}"] if several or f.returning else []),
             *(f"  {text}" for text in f.later),
             *(f"doubtful: {text}" for text in self.doubts),
             *_missing_lines(self),
