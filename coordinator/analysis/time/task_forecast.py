@@ -472,7 +472,9 @@ def _until_back(view: StochasticView) -> Gspn:
         return view.gspn
     own = net.place_index[view.task.runs_place]
     produce = tuple(
-        tuple(arc for arc in arcs if arc[0] != own) if view.origin.get(name.removesuffix(STEP)) in back else arcs
+        tuple(arc for arc in arcs if arc[0] != own)
+        if view.origin.get(name.removesuffix(STEP)) in back
+        else arcs
         for name, arcs in zip(net.transitions, net.produce, strict=True)
     )
     return replace(view.gspn, net=replace(net, produce=produce))
