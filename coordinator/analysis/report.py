@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
-from petrobot.coordinator.analysis.execution.graph import STEPS, Shared, TooManyValues, in_words
+from petrobot.coordinator.analysis.execution.graph import (
+    STEPS,
+    ExecutionGraph,
+    Shared,
+    TooManyValues,
+    in_words,
+)
 from petrobot.coordinator.analysis.execution.progress import (
     NAMES,
     Odds,
@@ -56,7 +62,7 @@ from petrobot.coordinator.analysis.time.task_forecast import (
 )
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
-from petrobot.coordinator.task.wording import COLUMNS, together, wrapped
+from petrobot.coordinator.task.wording import COLUMNS, few, together, wrapped
 
 
 @dataclass(frozen=True)
@@ -294,7 +300,7 @@ class Analysis:
             "complete": q.space.complete and not self.interrupted,
             "reason": q.space.reason or (INTERRUPTED if self.interrupted else ""),
             "engine": q.space.engine,
-            "bounded": q.bounded.holds,
+            "bounded": named["bounded"].holds,
             "max_tokens_per_place": q.most,
             "max_tokens_in_marking": self._most_in_marking(),
             "bounds": dict(zip(self.net.places, q.bounds, strict=True)),
@@ -377,6 +383,8 @@ class Analysis:
         if self.progress is not None and self.progress.x.complete and q.bounded.holds is not True:
             finite = f"the task rests in {len(self.progress.x)} states only"
             out["bounded"] = PropertyVerdict(True, finite)
+        elif self.progress is not None and q.bounded.holds is False:
+            out["bounded"] = _growing(self.progress.x)
         if self.progress is None and not self.unjudged:
             return out | {
                 "deadlock_free": q.deadlock_free,
@@ -483,7 +491,7 @@ class Analysis:
             f"{'with few phases: ' if told else head}P_complete {done.probability:.9f}, {goal}"
             f"R_conj {f.conjunctive_reliability:.6f}",
             time if done.probability else never,
-            *([f"  one trial: {_figures(f.one_trial.told)}"] if several else []),
+            *([f"  one trial: {_figures(f.one_trial.told)}"] if several or f.returning else []),
             *(f"  {text}" for text in f.later),
             *(f"doubtful: {text}" for text in self.doubts),
             *_missing_lines(self),
@@ -642,6 +650,9 @@ def _analyse_task(
             most = steps if found.bounded.holds is not False else min(steps, LOOK)
             try:
                 progress = progress_of(ordinary, most, measured, devices, shared)
+                x = progress.x
+                if most < steps and not x.complete and x.growth is None:
+                    progress = progress_of(ordinary, steps, measured, devices, shared)
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)
@@ -869,6 +880,20 @@ def _as_played(
         f"{plays.missions} missions of the execution graph with exact times have other figures: "
         f"{', '.join(off)}. Here a timer or a duration has at most {stages} phases"
     ]
+
+
+def _growing(x: ExecutionGraph) -> PropertyVerdict:
+    """Return that the task is unbounded if the engine has shown it. In its ends net transitions may
+    wait although they can fire, so that tokens pile up which the engine takes at once."""
+    if x.growth is None:
+        text = "unknown: the ends net is unbounded, but no path was found that adds tokens for ever"
+        return PropertyVerdict(None, text, complete=False)
+    first, last = x.growth
+    before, after = x.marked(first), x.marked(last)
+    grows = few([p for p, n in after.items() if n > before.get(p, 0)])
+    again = x.firings(last)[len(x.firings(first)) :]
+    text = f"{grows} can grow without bound: {' '.join(again)} can be repeated for ever"
+    return PropertyVerdict(False, text, Witness(x.firings(first), before, again))
 
 
 def _figures(figures: Mapping[str, float]) -> str:

@@ -187,3 +187,58 @@ def test_n_keeps_how_a_run_ended(what: str) -> None:
 @given(tasks(), st.data())
 def test_every_path_of_the_engine_is_one_of_n_at_length(task: Task, data: st.DataObject) -> None:
     assume(n_holds_x(task, data.draw(st.sampled_from(({}, DEVICES)))))
+
+
+GLANCES = """
+schema = 1
+[task]
+name = "glances"
+final = "left == 0 and right == 0 and seen >= 0"
+[primitive_tasks]
+carry = { goal = "carried", deadline = 9.0 }
+film = { goal = "filmed", deadline = 9.0 }
+[events]
+motion = { by = "film" }
+[places]
+left = { kind = "control", tokens = 3 }
+right = { kind = "control", tokens = 3 }
+carry_left = { kind = "action", task = "carry", servers = 3 }
+carry_right = { kind = "action", task = "carry", servers = 3 }
+film = { kind = "action", tokens = 1, listen = true }
+seen = { listen = true }
+[transitions]
+l = { in = ["left"], out = ["carry_left"] }
+r = { in = ["right"], out = ["carry_right"] }
+l_done = { in = ["carry_left:normal"] }
+r_done = { in = ["carry_right:normal"] }
+l_lost = { in = ["carry_left:error"], out = ["left"] }
+r_lost = { in = ["carry_right:error"], out = ["right"] }
+glance = { in = ["film:going"], out = ["seen"], event = "motion" }
+filmed = { in = ["film:normal"], out = ["film"] }
+blind = { in = ["film:error"], out = ["film"] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "steps", "bounded"),
+    [
+        ('note = { in = ["seen"] }\n', 20, None),
+        ('note = { in = ["seen"] }\n', 5_000, True),
+        ("", 200, False),
+        ('note = { in = ["seen", "!seen*4"] }\n', 20, None),
+        ('both = { in = ["seen*2"] }\n', 20, None),
+        ('more = { in = ["seen*3"], out = ["left"] }\n', 3_000, False),  # its runs queue
+    ],
+)
+def test_a_task_grows_only_if_the_engine_shows_it(
+    more: str, steps: int, bounded: bool | None
+) -> None:
+    """In the ends net `note` may wait for ever; the engine fires it at once."""
+    found = analyse(loads(GLANCES + more, "t.toml"), steps=steps)
+    assert found.qualitative.bounded.holds is False
+    said = found.verdicts()["bounded"]
+    assert said.holds is bounded and found.to_json()["bounded"] is bounded
+    assert ("bounded" in found.objections) == (bounded is False)
+    if bounded is False:
+        assert said.witness is not None and said.witness.loop
+        assert "can grow without bound" in said.reason

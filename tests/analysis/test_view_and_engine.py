@@ -1082,3 +1082,22 @@ def test_a_transition_can_fire_if_one_of_its_copies_can() -> None:
     assert judged.analysis is not None
     verdicts = judged.analysis.verdicts()
     assert verdicts["quasi_live"].holds and verdicts["live"].holds
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+@pytest.mark.parametrize("timed", [False, True])
+def test_one_trial_ends_when_its_token_is_given_back(parts: int, timed: bool) -> None:
+    """As in a campaign, where the next trial takes that token. `timed`: each transition gives in a
+    second step, because its taking alone may drop a timer."""
+    text = Text(parts, moves=[arcs("bad", "work:error", "parts,arm")])
+    if timed:
+        text.places.append("here = { tokens = 1, listen = true }\n")
+        text.moves.append(arcs("look", "here,!work", "here", ", after = 2.0"))
+    found = analyse(text.task(), view="gspn")
+    assert found.forecast is not None
+    told = found.forecast.one_trial.told
+    assert told["R_goal"] == pytest.approx(0.8) and told["P_complete"] == pytest.approx(1.0)
+    assert told["R_conj"] == pytest.approx(0.7)
+    assert told["mean time (s)"] == pytest.approx(0.7 * 2.0 + 0.1 * 1.0 + 0.2 * 1.5)
+    assert found.forecast.told["R_goal"] == pytest.approx(1.0)
+    assert "one trial: P_complete 1.000000, R_goal 0.800000" in found.text()

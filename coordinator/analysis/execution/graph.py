@@ -13,6 +13,7 @@ the beginning, so that a dead end far away is found.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -82,6 +83,9 @@ together, and each holds one while it waits for the next."""
 DOUBLED, CARELESS = 4, 0.25
 """How often the length of a quick play is doubled at most, and the share of those in which runs may
 end in ERROR."""
+LEVELS, EACH, REPEATS = 64, 8, 20_000
+"""How far back an earlier state is compared for growth, how many states are tried at each distance,
+and how many stimuli are repeated at most."""
 STALE = 16
 """Steps without a new state after which a play continues at the nearest new one."""
 QUEUE = 16
@@ -175,6 +179,67 @@ class ExecutionGraph:
     def graph(self) -> Graph:
         """The states and edges as a graph."""
         return Graph(len(self.states), self.source, self.target)
+
+    @cached_property
+    def growth(self) -> tuple[int, int] | None:
+        """Two states of which the second leaves more tokens than the first, on a path that the
+        engine has repeated until its tokens exceed all that an arc, a capacity or an end asks for:
+        further tokens change nothing, so it can be repeated for ever. None if none was found."""
+        parent = np.array([0 if came is None else came[0] for came in self.came])
+        tokens = np.array([state.marking for state in self.states])
+        left, older, last = REPEATS, parent, np.full(len(parent), -1)
+        for _ in range(LEVELS):
+            more = tokens - tokens[older]
+            hits = (more >= 0).all(axis=1) & (more > 0).any(axis=1) & (older != last)
+            for j in np.flatnonzero(hits)[:EACH].tolist():
+                left = self._repeat(int(older[j]), j, left)
+                if left < 0:
+                    return int(older[j]), j
+            if not left or not older.any():
+                return None
+            older, last = parent[older], older
+        return None
+
+    def _repeat(self, first: int, last: int, left: int) -> int:
+        """Let the engine repeat the path between two states. Return how many stimuli are left for
+        other paths; -1 if this one can be repeated for ever."""
+        path = self.path(last)[len(self.path(first)) :]
+        before, state, orders = self.states[first].marking, self.states[last], self.orders[last]
+        more = np.subtract(state.marking, before)
+        laps = max(self._most[p] // more[p] for p in np.flatnonzero(more)) + 2
+        if laps * len(path) > left:
+            return left
+        for _ in range(laps):
+            before = state.marking
+            for step in path:
+                for cause in self.names.stimuli(state, orders):
+                    if cause.text != step.text:
+                        continue
+                    left -= 1
+                    after, said = self.engine.handle(state, cause.stimulus)
+                    if _fired(said) == step.firings:
+                        orders = self.names.next_orders(state, orders, after)
+                        state = after
+                        break
+                else:
+                    return max(left, 0)
+            if (np.subtract(state.marking, before) != more).any():
+                return max(left, 0)
+        return -1
+
+    @cached_property
+    def _most(self) -> list[int]:
+        """By place: more tokens than this change nothing that the engine tests."""
+        net, task = self.engine.compiled.net, self.engine.compiled.task
+        asked = [int(n) for n in re.findall(r"\d+", f"{task.final} {task.final_error}")]
+        most = [
+            max(asked, default=0) + (capacity or 0) + task.places[name].most_active
+            for name, capacity in zip(net.places, net.capacity, strict=True)
+        ]
+        for arcs in (*net.consume, *net.produce, *net.inhibit):
+            for p, n in arcs:
+                most[p] += n
+        return most
 
     @cached_property
     def fires(self) -> Mask:

@@ -85,6 +85,8 @@ REST = 750_000
 GIVING = "to give"
 """Place with a token between the moment at which a firing takes its tokens and the moment at which
 it gives them, where the engine may drop a timer or a latched event in between."""
+STEP = " gives"
+"""What is added to the name of a firing for the moment at which it gives."""
 STAGES = 8
 """Default limit of the phases of one duration. Phases of parallel runs multiply the number of
 markings, so it is small."""
@@ -1099,7 +1101,7 @@ class _Derivation:
         others, it gives in a second step."""
         if not self._drops(self.compiled[t.name]):
             return Counter(case.back) + Counter(case.give)
-        step = f"{name} gives"
+        step = f"{name}{STEP}"
         self.parts.places |= {step: 0, GIVING: 0}
         self.parts.immediate(step, {step: 1, GIVING: 1}, case.give, 1.0, FLUSH - 3)
         return {**case.back, step: 1, GIVING: 1}

@@ -36,10 +36,10 @@ from petrobot.coordinator.analysis.time.completion import (
     slopes_of,
     time_slopes,
 )
-from petrobot.coordinator.analysis.time.gspn import Chain, Values
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import visits_before
-from petrobot.coordinator.analysis.time.stochastic import StochasticView, timer_key
+from petrobot.coordinator.analysis.time.stochastic import STEP, StochasticView, timer_key
 from petrobot.coordinator.task import Kind, Status
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import few
@@ -113,8 +113,14 @@ class Forecast:
     def one_trial(self) -> Forecast:
         """The forecast of a mission run with one run token: what a campaign measures, whose figures
         are per trial. As there, its time begins when the token is taken, so without the wait before
-        it. Its long-run numbers do not hold for missions of several trials."""
+        it, and a token that is given back is not taken again. Its long-run numbers do not hold for
+        missions of several trials."""
         return trial_forecast(self.view) if self.view.task.runs_place else self
+
+    @property
+    def returning(self) -> frozenset[str]:
+        """The transitions that give the run token back, which the next trial takes."""
+        return _returning(self.view)
 
     @property
     def later(self) -> tuple[str, ...]:
@@ -257,7 +263,9 @@ class Forecast:
     def goal_reliability(self) -> float | None:
         """R_goal; None if the task names no goal transitions or no runs place, or if one of several
         run tokens can meet several goals: then no state says which of them has met one."""
-        goals, alone = self.goals, self if self.trials == 1 else self.one_trial
+        goals, alone = self.goals, self
+        if self.trials != 1:
+            alone = trial_forecast(self.view, again=True) if self.returning else self.one_trial
         if goals is None or alone.goals is None:
             return None
         once = alone._meets_goal
@@ -431,18 +439,45 @@ class Forecast:
         }  # fmt: skip
 
 
-def trial_forecast(view: StochasticView, limits: SearchLimits | None = None) -> Forecast:
+def trial_forecast(
+    view: StochasticView, limits: SearchLimits | None = None, *, again: bool = False
+) -> Forecast:
     """Return the forecast of one trial: with one run token if the task has a runs place, and all
-    times from when that token is taken. Raises as `forecast`."""
+    times from when that token is taken. `again`: one that is given back is taken again. Raises as
+    `forecast`."""
     own = view.task.runs_place
     if not own:
         return forecast(view, limits=limits)
-    alone = forecast(replace(view, gspn=view.gspn.marked({own: 1})), limits=limits)
+    gspn = (view.gspn if again else _until_back(view)).marked({own: 1})
+    alone = forecast(replace(view, gspn=gspn), limits=limits)
     chain = alone.chain
     waiting = chain.space.tokens(view.task.net.place_index[own]) > 0
     waiting &= np.bincount(chain.source, minlength=chain.n) > 0
     chain = replace(chain, vanishing=chain.vanishing | waiting)  # no time passes before
     return replace(alone, chain=chain, done=completion(chain, alone.done.goal))
+
+
+def _returning(view: StochasticView) -> frozenset[str]:
+    """Return the transitions of the task that give the run token back."""
+    net, own = view.task.net, view.task.runs_place
+    place = net.place_index[own] if own else -1
+    changes = zip(net.transitions, net.compiled.changes, strict=True)
+    return frozenset(name for name, moved in changes if dict(moved).get(place, 0) > 0)
+
+
+def _until_back(view: StochasticView) -> Gspn:
+    """Return the view's net, in which a run token that is given back is gone: a trial ends then."""
+    net, back = view.gspn.net, _returning(view)
+    if not back:
+        return view.gspn
+    own = net.place_index[view.task.runs_place]
+    produce = tuple(
+        tuple(arc for arc in arcs if arc[0] != own)
+        if view.origin.get(name.removesuffix(STEP)) in back
+        else arcs
+        for name, arcs in zip(net.transitions, net.produce, strict=True)
+    )
+    return replace(view.gspn, net=replace(net, produce=produce))
 
 
 def forecast(view: StochasticView, *, limits: SearchLimits | None = None) -> Forecast:

@@ -59,7 +59,7 @@ class Move:
     """Nothing but how often it fired tells whether its condition holds."""
     is_goal: bool
     takes_run: bool
-    """It takes a token out of the runs place."""
+    """It takes a token out of the runs place, and does not give it back at once."""
 
     @property
     def name(self) -> str:
@@ -140,6 +140,7 @@ def _move(flat: Task, t: Transition, compiled: CompiledTransition) -> Move:
     ends = [a.name for a in compiled.actions if a.end in (End.NORMAL, End.ERROR)]
     allowed = _allowed(t, ends)
     known = t.when is not None and allowed is None and t.when.names <= known_variables(flat)
+    moved = {flat.net.places[p]: n for p, n in flat.net.compiled.changes[compiled.index]}
     return Move(
         compiled,
         is_cause(flat, t),
@@ -150,7 +151,7 @@ def _move(flat: Task, t: Transition, compiled: CompiledTransition) -> Move:
         t.when if known else None,
         t.when is not None and allowed is None and not known and not ends,
         t.name in flat.goal_transitions,
-        any(a.place == flat.runs_place for a in t.inputs),
+        moved.get(flat.runs_place, 0) < 0,
     )
 
 

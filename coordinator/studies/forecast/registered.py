@@ -197,18 +197,12 @@ def exact(
         "q90": q90,
         "P_complete_error": found.completion_error,
     }
-    again = [
-        f"{t.name} gives the run token back: this view takes it again, and the trial continues; a "
-        "measured one ends there"
-        for t in task.flat.transitions.values()
-        if any(out.place == task.runs_place for out in t.outputs) and found.firings[t.name] > 0.0
-    ]
     # digits, not decimals: a probability of 1e-6 keeps its own
     return {
         **{k: None if v is None else float(f"{v:.7g}") for k, v in numbers.items()},
         "P_complete_interval": _share_error(task, estimates, context, found, apart or {}),
         "markings": found.chain.n,
-        "notes": [*again, *found.later],
+        "notes": [*found.later],
     }
 
 

@@ -360,7 +360,7 @@ def _moved(k: int) -> Trial:
          0.6 * 0.4, None, False),
         # a run token that is given back ends its trial
         (('in = ["fetch:error"]\nout = ["free"]', 'in = ["fetch:error"]\nout = ["free", "jobs"]'),
-         0.6, None, False),
+         0.6, 0.6, False),
     ],
 )  # fmt: skip
 def test_a_changed_deadline_ends_the_runs_that_were_measured(

@@ -279,6 +279,25 @@ b_lost: b:error ->
     assert (played.goals.tolist(), played.time.tolist()) == ([1], [time])
 
 
+def test_a_transition_that_gives_the_run_token_back_at_once_begins_no_trial() -> None:
+    """As in a campaign: the device is warmed up as soon as there is work."""
+    text = """
+[places.cold]
+kind = "control"
+tokens = 1
+warm: cold, jobs -> b, jobs
+begin: jobs, !cold, !b -> a
+done: a:normal ->
+lost: a:error ->
+b_done: b:normal ->
+b_lost: b:error ->
+"""
+    runs = [entry("b", 1.0, taken="b_done"), entry("a", 2.0, taken="done")]
+    keys = 'final = "jobs == 0"\nruns_place = "jobs"\ngoal_transitions = ["done"]'
+    played = play(text, [Trial(1, 0.0, runs=runs)], 1, keys)
+    assert (played.goals.tolist(), played.time.tolist()) == ([1], [2.0])
+
+
 def test_giving_up_and_dead_ends_do_not_complete() -> None:
     """Tried with final_error, and with a dead marking."""
     text = """
