@@ -247,7 +247,7 @@ async def test_what_a_short_form_adds_has_a_name_for_people(browser: Browser, pa
         ],
     }
     script = """async (task) => {
-      const { labelsOf } = await import("/page/js/sheet.js");
+      const { labelsOf } = await own("sheet.js");
       return Object.fromEntries(labelsOf(task));
     }"""
     labels = await tab.evaluate(script, task)
@@ -260,9 +260,9 @@ async def test_live_and_design_draw_the_same_net(browser: Browser, page: Page) -
     flat net of a run, the other from the file."""
     tab = await opened(browser, page)
     script = """async ([picture, file]) => {
-      const { sheetOf } = await import("/page/js/sheet.js");
-      const { drawn } = await import("/page/js/design/drawn.js");
-      const { placed } = await import("/page/js/layout.js");
+      const { sheetOf } = await own("sheet.js");
+      const { drawn } = await own("design/drawn.js");
+      const { placed } = await own("layout.js");
       const seen = (e) => [e.name, [e.x, e.y, e.sub, Boolean(e.error)]];
       const joins = (a) => [a.direction, a.place, a.end ?? "", a.transition, a.weight].join(" ");
       const told = ({ places, transitions, arcs }) => [
@@ -548,7 +548,7 @@ async def test_history(
     )
     await scrub.get_by_role("button", name="Previous error").click()
     await tab.screenshot(path=shots / "history.png")
-    said = "(text) => import('/page/js/toast.js').then((m) => m.toast('error', text))"
+    said = "(text) => own('toast.js').then((m) => m.toast('error', text))"
     await tab.evaluate(said, "Refused: another run is active")
     toast, bar = await tab.locator(".toast").last.bounding_box(), await scrub.bounding_box()
     assert toast is not None and bar is not None
@@ -619,7 +619,7 @@ async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, 
     random sequences of changes."""
     tab = await opened(browser, page)
     script = """async ([state, changes]) => {
-      const { apply } = await import("/page/js/state.js");
+      const { apply } = await own("state.js");
       for (const change of changes) apply(state, change);
       return state;
     }"""

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.page.server import Page, start_page
-from tests.page.conftest import browser_missing, nobody_listens, served
+from tests.page.conftest import SIZE, browser_missing, nobody_listens, served
 from tests.page.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -22,7 +22,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, WebSocketRoute, expect
 from playwright.async_api import Page as Tab
 
-from tests.page.steps import SIZE, Watch, element, opened, start_mission
+from tests.page.steps import Watch, element, opened, start_mission
 from tests.waiting import until
 
 Mangle = Callable[[str], str | bytes]
@@ -350,7 +350,7 @@ async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page)
 
 async def test_a_page_whose_script_does_not_arrive_says_so(browser: Browser, page: Page) -> None:
     context = await browser.new_context(viewport=SIZE)
-    await context.route("**/page/js/state.js", lambda route: route.abort())
+    await context.route("**/js/state.js", lambda route: route.abort())
     tab = await context.new_page()
     await tab.goto(page.url)
     await expect(tab.get_by_role("alert")).to_contain_text("could not start")

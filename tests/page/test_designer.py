@@ -25,7 +25,8 @@ from tests.drawing.conftest import random_task
 from tests.page.conftest import (
     PATIENCE_MS,
     browser_missing,
-    is_fault,
+    errors_of,
+    new_window,
     note_toasts,
     toasted,
 )
@@ -49,21 +50,14 @@ async def designing(
     browser: Browser, page: Page, task: str = "pick_and_place"
 ) -> tuple[Tab, list[str]]:
     """Open the designer with a task; also return the list of errors in its window."""
-    context = await browser.new_context(viewport={"width": 1440, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
-    tab = await context.new_page()
-    complaints: list[str] = []
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.on(
-        "console", lambda message: complaints.append(message.text) if is_fault(message) else None
-    )
+    tab = await new_window(browser)
     await tab.goto(f"{page.url}#design")
     await settled(tab)
     await expect(tab.get_by_label("Task", exact=True)).to_have_value("pick_and_place")
     await note_toasts(tab)
     if task != "pick_and_place":
         await open_task(tab, task)
-    return tab, complaints
+    return tab, errors_of(tab)
 
 
 async def open_task(tab: Tab, task: str) -> None:
@@ -484,7 +478,7 @@ async def test_the_page_has_the_same_layout_as_the_command_line(
     positions; also long ones, which are folded, with resources beside their layers."""
     tab, _ = await designing(browser, page)
     script = """async ([names, edges, sources, aside]) => {
-      const { layered } = await import("/page/js/layers.js");
+      const { layered } = await own("layers.js");
       return layered(names, edges, sources, aside);
     }"""
     for names, edges, sources, aside in [*map(short_net, range(12)), *map(long_net, range(6))]:
