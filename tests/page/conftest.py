@@ -16,6 +16,7 @@ from weakref import WeakKeyDictionary
 import pytest
 import pytest_asyncio
 
+from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.task import Executed, Status
 from petrobot.coordinator.task.file import load
@@ -91,8 +92,10 @@ async def served(stage: Stage, tasks: Path, runs: Path, port: int = 0) -> AsyncI
     made = await start_page(
         stage, tasks_folder=tasks, port=port, token="open sesame", offers=stage.offers, runs=runs
     )
-    yield made
-    await made.close()
+    try:
+        yield made
+    finally:  # or the next page could not have its port
+        await made.close()
 
 
 @pytest_asyncio.fixture(loop_scope="session")
@@ -110,11 +113,35 @@ def port() -> Iterator[int]:
         yield number
 
 
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def background() -> AsyncIterator[dict[str, BackgroundProcess]]:
+    """The processes that check and analyse drawings: what they import takes half a second."""
+    made = {name: BackgroundProcess() for name in ("apart", "checks", "analyses")}
+    yield made
+    for process in made.values():
+        await process.close()
+
+
 @pytest_asyncio.fixture(loop_scope="session")
-async def page(stage: Stage, tasks: Path, tmp_path: Path, port: int) -> AsyncIterator[Page]:
-    """Its page."""
+async def page(
+    stage: Stage,
+    tasks: Path,
+    tmp_path: Path,
+    port: int,
+    background: dict[str, BackgroundProcess],
+    request: pytest.FixtureRequest,
+) -> AsyncIterator[Page]:
+    """Its page. With a browser it works with the background processes of the test before; one that
+    is still at work when the test ends is ended."""
     async with served(stage, tasks, tmp_path / "runs", port) as made:
+        state = vars(made._page_state)
+        own = {name: state[name] for name in background if "browser" in request.fixturenames}
+        state.update((name, background[name]) for name in own)
         yield made
+        for process in background.values():
+            if process._current is not None:
+                await process.close()
+        state.update(own)
 
 
 def browser_missing() -> str:

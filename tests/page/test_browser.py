@@ -277,6 +277,35 @@ async def test_live_and_design_draw_the_same_net(browser: Browser, page: Page) -
         assert live == design, task["name"]
 
 
+TICKS = """() => {
+  const observer = new MutationObserver(() => {});
+  const all = { attributes: true, characterData: true, childList: true, subtree: true };
+  observer.observe(document, all);
+  for (let tick = 0; tick < 20; tick += 1) petrobot.tick();
+  return observer.takeRecords().map((m) => m.attributeName ?? m.target.nodeName);
+}"""
+SHADE = "getComputedStyle(document.querySelector('.banner .state'), '::before').opacity"
+
+
+async def test_a_page_at_which_nothing_happens_is_not_drawn_again(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """It stays open for days. Its ticks change nothing while the state is the same, and what blinks
+    is no endless animation, for which a browser draws sixty times a second."""
+    tab = await opened(browser, page)
+    await expect(tab.get_by_role("button", name="Take controls")).to_be_visible()
+    await tab.evaluate(TICKS)
+    assert set(await tab.evaluate(TICKS)) <= {"data-beat"}
+    stage.kept.add("clear")
+    await start_mission(tab)
+    stage.happen("part_there")
+    await expect(tab.locator(".net [data-name=pick] .mark.alarm")).to_be_visible()
+    for shade in ("0.3", "1", "0.3"):
+        await tab.wait_for_function(f"() => {SHADE} === '{shade}'")
+    endless = "document.getAnimations().filter((a) => a.effect.getTiming().iterations > 9).length"
+    assert await tab.evaluate(endless) == 0
+
+
 async def test_firings_of_another_run_are_not_taken_for_those_shown(
     browser: Browser, page: Page, stage: Stage
 ) -> None:

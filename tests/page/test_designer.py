@@ -594,10 +594,8 @@ COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8
 async def test_labels_on_the_page_cover_nothing(browser: Browser, page: Page, tasks: Path) -> None:
     """Measured in the browser on random nets laid out by the page: no label covers a label or an
     element, and few arcs cross labels."""
-    tab, _ = await designing(browser, page)
-    total: Counter[str] = Counter()
-    for seed in range(40, 45):
-        net = random_task(np.random.default_rng(seed), 3)
+    nets = {f"random_{seed}": random_task(np.random.default_rng(seed), 3) for seed in range(40, 45)}
+    for name, net in nets.items():
         arcs = [
             f"in = {[net.places[p] for p, _ in net.consume[t]]}\nout = "
             f"{[net.places[p] for p, _ in net.produce[t]]}\n"
@@ -611,11 +609,11 @@ async def test_labels_on_the_page_cover_nothing(browser: Browser, page: Page, ta
         text += "".join(
             f"[transitions.{t}]\n{a}" for t, a in zip(net.transitions, arcs, strict=True)
         )
-        (tasks / f"random_{seed}.toml").write_text(text)
-        await tab.reload()
-        await settled(tab)
-        await expect(tab.locator(".saved")).to_have_text("saved")
-        await open_task(tab, f"random_{seed}")
+        (tasks / f"{name}.toml").write_text(text)
+    tab, _ = await designing(browser, page)
+    total: Counter[str] = Counter()
+    for name, net in nets.items():
+        await open_task(tab, name)
         await expect(element(tab, "^Transition ")).to_have_count(len(net.transitions))
         total.update(await tab.evaluate(COVERED))
     assert total["words"] > 80
