@@ -251,7 +251,7 @@ async def _chromium() -> AsyncIterator[Browser]:
 
 
 @dataclass
-class _Kept:
+class KeptWindow:
     """A window that stays open for the next test: most of what a new one costs is its process."""
 
     tab: Tab | None = None
@@ -260,7 +260,8 @@ class _Kept:
     async def empty(self) -> None:
         """Make it a new user's again: leave the page for an empty one of its origin, and forget
         what the page has stored there."""
-        assert self.tab is not None
+        if self.tab is None or not self.taken or self.tab.is_closed():
+            return
         context = self.tab.context
         await self.tab.unroute_all()
         for other in context.pages:
@@ -272,26 +273,27 @@ class _Kept:
         await context.clear_cookies()
         await self.tab.mouse.move(0, 0)
         errors_of(self.tab).clear()
+        self.taken = False
 
 
-_kept = _Kept()
+kept = KeptWindow()
 
 
 async def new_window(browser: Browser, theme: Literal["light", "dark"] = "light") -> Tab:
     """Return an empty window of a new user: the kept one, or another one if the test has it."""
-    if _kept.tab is not None and not _kept.taken:
-        _kept.taken = True
-        await _kept.tab.set_viewport_size(SIZE)
-        await _kept.tab.emulate_media(color_scheme=theme)
-        return _kept.tab
+    if kept.tab is not None and not kept.taken:
+        kept.taken = True
+        await kept.tab.set_viewport_size(SIZE)
+        await kept.tab.emulate_media(color_scheme=theme)
+        return kept.tab
     context = await browser.new_context(
         viewport=SIZE, color_scheme=theme, reduced_motion="no-preference"
     )
     context.set_default_timeout(PATIENCE_MS)
     tab = await context.new_page()
     errors_of(tab)
-    if _kept.tab is None:
-        _kept.tab, _kept.taken = tab, True
+    if kept.tab is None:
+        kept.tab, kept.taken = tab, True
     return tab
 
 
@@ -302,12 +304,11 @@ async def browser(_chromium: Browser, request: pytest.FixtureRequest) -> AsyncIt
     failed = request.session.testsfailed
     yield _chromium
     try:
-        if _kept.taken and request.session.testsfailed == failed:
-            await _kept.empty()
-            _kept.taken = False
+        if request.session.testsfailed == failed:
+            await kept.empty()
     finally:
-        if _kept.taken:
-            _kept.tab, _kept.taken = None, False
+        if kept.taken:
+            kept.tab, kept.taken = None, False
         for context in _chromium.contexts:
-            if _kept.tab is None or context is not _kept.tab.context:
+            if kept.tab is None or context is not kept.tab.context:
                 await context.close()

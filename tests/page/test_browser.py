@@ -28,6 +28,7 @@ from tests.page.conftest import (
     PATIENCE_MS,
     abort,
     browser_missing,
+    kept,
     nobody_listens,
     served,
     toasted,
@@ -115,6 +116,37 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
         "the part slipped out of the gripper"
     )
     await tab.screenshot(path=shots / "why.png")
+
+
+async def test_the_window_of_the_test_before_is_that_of_a_new_user(
+    browser: Browser, page: Page, faults: Watch
+) -> None:
+    """Nothing is left of its drawing, its colours, its routes, its errors or who it was."""
+    for _ in range(2):
+        tab = await opened(browser, page)
+        assert tab is kept.tab and faults(tab) == []
+        assert await tab.evaluate("[innerWidth, localStorage['petrobot.theme']]") == [1440, "light"]
+        assert await tab.evaluate("[Object.keys(localStorage).length, sessionStorage.length]") == [
+            2,
+            0,
+        ]
+        await hold_controls(tab)
+        await tab.get_by_role("button", name="Release").click()
+        await tab.get_by_role("tab", name="Design").click()
+        await settled(tab)
+        await expect(tab.locator(".saved")).to_have_text("saved")
+        await element(tab, "^Action place pick").click()
+        await tab.keyboard.press("Delete")
+        await expect(element(tab, "^Action place pick")).to_have_count(0)
+        await tab.get_by_role("button", name="Dark colours").click()
+        await tab.evaluate("localStorage.other = sessionStorage.other = 'left'")
+        await tab.evaluate("console.error('left')")
+        await until(lambda: faults(tab) == ["left"])  # noqa: B023
+        await tab.route("**/*", lambda route: route.abort())
+        await tab.set_viewport_size({"width": 800, "height": 600})
+        await tab.context.new_page()
+        await kept.empty()
+        assert tab.context.pages == [tab] and await tab.context.cookies() == []
 
 
 async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
