@@ -284,7 +284,7 @@ async def new_window(browser: Browser, theme: Literal["light", "dark"] = "light"
     if kept.tab is not None and not kept.taken:
         kept.taken = True
         await kept.tab.set_viewport_size(SIZE)
-        await kept.tab.emulate_media(color_scheme=theme)
+        await kept.tab.emulate_media(color_scheme=theme, reduced_motion="no-preference")
         return kept.tab
     context = await browser.new_context(
         viewport=SIZE, color_scheme=theme, reduced_motion="no-preference"

@@ -316,6 +316,13 @@ TICKS = """() => {
   for (let tick = 0; tick < 20; tick += 1) petrobot.tick();
   return observer.takeRecords().map((m) => m.attributeName ?? m.target.nodeName);
 }"""
+BEAT = """() => {
+  const { now } = performance;
+  performance.now = () => 800;
+  petrobot.tick();
+  performance.now = now;
+  return document.documentElement.dataset.beat;
+}"""
 SHADE = "getComputedStyle(document.querySelector('.banner .state'), '::before').opacity"
 
 
@@ -323,7 +330,8 @@ async def test_a_page_at_which_nothing_happens_is_not_drawn_again(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
     """It stays open for days. Its ticks change nothing while the state is the same, and what blinks
-    is no endless animation, for which a browser draws sixty times a second."""
+    is no endless animation, for which a browser draws sixty times a second. Nothing blinks for
+    people who want no motion."""
     tab = await opened(browser, page)
     await expect(tab.get_by_role("button", name="Take controls")).to_be_visible()
     await tab.evaluate(TICKS)
@@ -336,6 +344,9 @@ async def test_a_page_at_which_nothing_happens_is_not_drawn_again(
         await tab.wait_for_function(f"() => {SHADE} === '{shade}'")
     endless = "document.getAnimations().filter((a) => a.effect.getTiming().iterations > 9).length"
     assert await tab.evaluate(endless) == 0
+    assert await tab.evaluate(BEAT) == "off"
+    await tab.emulate_media(reduced_motion="reduce")
+    assert await tab.evaluate(BEAT) == "on"
 
 
 async def test_firings_of_another_run_are_not_taken_for_those_shown(
