@@ -163,11 +163,14 @@ def _version() -> str:
 
 
 async def _file(request: web.Request) -> web.StreamResponse:
-    """A file of the page. Modules import each other relatively, so all have one version."""
+    """A file of the page. Modules import each other relatively, so all have one version. A window
+    that was opened before an update gets the new files, but keeps none under the old address."""
+    asked = request.match_info
     with contextlib.suppress(ValueError):  # a zero byte in the path
-        path = (PAGE_FILES / request.match_info["path"]).resolve()
+        path = (PAGE_FILES / asked["path"]).resolve()
         if path.is_relative_to(PAGE_FILES) and path.is_file():
-            return web.FileResponse(path, headers={"Cache-Control": KEPT})
+            now = asked["version"] == _version()
+            return web.FileResponse(path, headers={"Cache-Control": KEPT} if now else None)
     raise web.HTTPNotFound
 
 
