@@ -155,22 +155,20 @@ async def _index(request: web.Request) -> web.StreamResponse:
 
 
 def _version() -> str:
-    """Digest of all files of the page as they are now, also after an update of a running server."""
-    digest = hashlib.sha256()
-    for path in sorted(path for path in PAGE_FILES.rglob("*") if path.is_file()):
-        digest.update(f"{path.relative_to(PAGE_FILES)}\0".encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
+    """Digest of when the files of the page were changed, also after an update of a running server.
+    No version comes twice, so a window opened before an update keeps nothing that a later one
+    gets."""
+    found = [(str(path), path.stat()) for path in sorted(PAGE_FILES.rglob("*"))]
+    changed = [(path, s.st_size, s.st_mtime_ns, s.st_ctime_ns) for path, s in found]
+    return hashlib.sha256(repr(changed).encode()).hexdigest()[:16]
 
 
 async def _file(request: web.Request) -> web.StreamResponse:
-    """A file of the page. Modules import each other relatively, so all have one version. A window
-    that was opened before an update gets the new files, but keeps none under the old address."""
-    asked = request.match_info
+    """A file of the page. Modules import each other relatively, so all have one version."""
     with contextlib.suppress(ValueError):  # a zero byte in the path
-        path = (PAGE_FILES / asked["path"]).resolve()
+        path = (PAGE_FILES / request.match_info["path"]).resolve()
         if path.is_relative_to(PAGE_FILES) and path.is_file():
-            now = asked["version"] == _version()
-            return web.FileResponse(path, headers={"Cache-Control": KEPT} if now else None)
+            return web.FileResponse(path, headers={"Cache-Control": KEPT})
     raise web.HTTPNotFound
 
 
