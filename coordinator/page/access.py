@@ -22,7 +22,7 @@ from petrobot.services.comm.calls.link import allowed
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 HEADERS = {
-    # Without this, a browser would mix the scripts of two versions of petrobot after an update
+    # For all but the files of the page, whose address names their version
     "Cache-Control": "no-store",
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: "
@@ -142,7 +142,8 @@ def middleware(access: AccessRules) -> Middleware:
             refusal.headers.update(HEADERS)
             raise
         if not response.prepared:
-            response.headers.update(HEADERS)
+            for name, value in HEADERS.items():
+                response.headers.setdefault(name, value)
         return response
 
     return guard

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import secrets
 import socket as sockets
 from pathlib import Path
@@ -20,7 +21,9 @@ from petrobot.coordinator.page.requests import LARGEST_BODY, json_answer, read_o
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
 from petrobot.coordinator.page.task_store import TaskStore
 
-PAGE_FILES = Path(__file__).parent / "static"
+PAGE_FILES = (Path(__file__).parent / "static").resolve()
+KEPT = "private, max-age=31536000, immutable"
+"""Lets a browser keep a file of the page for good: another version has other addresses."""
 LAST_COMMANDS_S = 1.0
 """Time for commands to complete at the end (s), among them the one that ended the run (`abort`)."""
 
@@ -133,7 +136,7 @@ def _application(page_state: PageState, page: bool) -> web.Application:
     add_routes(app)
     if page:
         app.router.add_get("/", _index)
-        app.router.add_static("/page", PAGE_FILES, follow_symlinks=False)
+        app.router.add_get("/page/{version}/{path:.+}", _file)
         documents.add_routes(app)
     return app
 
@@ -145,7 +148,28 @@ async def _index(request: web.Request) -> web.StreamResponse:
         away = web.HTTPSeeOther("/")
         access.hand_out(away)
         raise away
-    return web.FileResponse(PAGE_FILES / "index.html")
+    front = (PAGE_FILES / "index.html").read_text(encoding="utf-8")
+    return web.Response(
+        text=front.replace('="/page/', f'="/page/{_version()}/'), content_type="text/html"
+    )
+
+
+def _version() -> str:
+    """Digest of when the files of the page were changed, also after an update of a running server.
+    No version comes twice, so a window opened before an update keeps nothing that a later one
+    gets."""
+    found = [(str(path), path.stat()) for path in sorted(PAGE_FILES.rglob("*"))]
+    changed = [(path, s.st_size, s.st_mtime_ns, s.st_ctime_ns) for path, s in found]
+    return hashlib.sha256(repr(changed).encode()).hexdigest()[:16]
+
+
+async def _file(request: web.Request) -> web.StreamResponse:
+    """A file of the page. Modules import each other relatively, so all have one version."""
+    with contextlib.suppress(ValueError):  # a zero byte in the path
+        path = (PAGE_FILES / request.match_info["path"]).resolve()
+        if path.is_relative_to(PAGE_FILES) and path.is_file():
+            return web.FileResponse(path, headers={"Cache-Control": KEPT})
+    raise web.HTTPNotFound
 
 
 # The live protocol over HTTP: the WebSocket, and the same commands and snapshot for scripts.

@@ -7,20 +7,23 @@ import shutil
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Final, Literal
+from weakref import WeakKeyDictionary
 
 import pytest
 import pytest_asyncio
 
+from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.task import Executed, Status
 from petrobot.coordinator.task.file import load
 from tests.page.stage import Part, Stage
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser, ConsoleMessage, Locator
+    from playwright.async_api import Browser, ConsoleMessage, Locator, ViewportSize
     from playwright.async_api import Page as Tab
 
 HERE = Path(__file__).parent
@@ -39,6 +42,7 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+SIZE: Final[ViewportSize] = {"width": 1440, "height": 900}
 PATIENCE_MS = 60_000  # for a condition: with other tests on two slow cores a browser may be late
 SLIPPED = Part(0.3, Status.ERROR, "slipped", "the part slipped out of the gripper", Executed.YES)
 SCRIPT = {
@@ -83,13 +87,15 @@ async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
 
 
 @asynccontextmanager
-async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
+async def served(stage: Stage, tasks: Path, runs: Path, port: int = 0) -> AsyncIterator[Page]:
     """Serve the page of a mission on loopback."""
     made = await start_page(
-        stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, runs=runs
+        stage, tasks_folder=tasks, port=port, token="open sesame", offers=stage.offers, runs=runs
     )
-    yield made
-    await made.close()
+    try:
+        yield made
+    finally:  # or the next page could not have its port
+        await made.close()
 
 
 @pytest_asyncio.fixture(loop_scope="session")
@@ -99,11 +105,43 @@ async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
         yield made
 
 
+@pytest.fixture(scope="session")
+def port() -> Iterator[int]:
+    """The page's port in all tests of this process: at the same address the browser has its files
+    already."""
+    with nobody_listens() as number:
+        yield number
+
+
+@pytest_asyncio.fixture(scope="session", loop_scope="session")
+async def background() -> AsyncIterator[dict[str, BackgroundProcess]]:
+    """The processes that check and analyse drawings: what they import takes half a second."""
+    made = {name: BackgroundProcess() for name in ("apart", "checks", "analyses")}
+    yield made
+    for process in made.values():
+        await process.close()
+
+
 @pytest_asyncio.fixture(loop_scope="session")
-async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
-    """Its page."""
-    async with served(stage, tasks, tmp_path / "runs") as made:
+async def page(
+    stage: Stage,
+    tasks: Path,
+    tmp_path: Path,
+    port: int,
+    background: dict[str, BackgroundProcess],
+    request: pytest.FixtureRequest,
+) -> AsyncIterator[Page]:
+    """Its page. With a browser it works with the background processes of the test before; one that
+    is still at work when the test ends is ended."""
+    async with served(stage, tasks, tmp_path / "runs", port) as made:
+        state = vars(made._page_state)
+        own = {name: state[name] for name in background if "browser" in request.fixturenames}
+        state.update((name, background[name]) for name in own)
         yield made
+        for process in background.values():
+            if process._current is not None:
+                await process.close()
+        state.update(own)
 
 
 def browser_missing() -> str:
@@ -127,17 +165,22 @@ def shots() -> Path:
 
 
 @pytest.fixture
-def faults() -> Callable[[Any], list[str]]:
-    """Collect the errors of a browser page: script errors, refused content, errors on the
-    console."""
+def faults() -> Callable[[Tab], list[str]]:
+    """Collect the errors of a browser page."""
+    return errors_of
 
-    def watch(tab: Any) -> list[str]:
-        found: list[str] = []
+
+_errors: WeakKeyDictionary[Tab, list[str]] = WeakKeyDictionary()
+
+
+def errors_of(tab: Tab) -> list[str]:
+    """Return the list of a window's errors, which grows: script errors, refused content, errors on
+    the console."""
+    if tab not in _errors:
+        found = _errors[tab] = []
         tab.on("pageerror", lambda error: found.append(f"script error: {error}"))
         tab.on("console", lambda message: found.append(message.text) if is_fault(message) else None)
-        return found
-
-    return watch
+    return _errors[tab]
 
 
 def is_fault(message: ConsoleMessage) -> bool:
@@ -147,6 +190,8 @@ def is_fault(message: ConsoleMessage) -> bool:
 
 
 NOTE_TOASTS = """() => {
+  const script = document.querySelector("script[type=module]").src;
+  window.own = (path) => import(new URL(path, script));  // a module that the page itself has loaded
   window.toasted = [...document.querySelectorAll(".toast")].map((toast) => toast.title);
   const keep = (toast) => window.toasted.push(toast.title);
   const note = (changes) => changes.forEach(({ addedNodes }) => addedNodes.forEach(keep));
@@ -156,7 +201,7 @@ NOTE_TOASTS = """() => {
 
 async def note_toasts(tab: Tab) -> None:
     """Keep the messages that the page shows for only a few seconds: a test that checks once a
-    second could miss one."""
+    second could miss one. `own` imports a module of the page."""
     await tab.evaluate(NOTE_TOASTS)
 
 
@@ -183,13 +228,13 @@ async def abort(toolbar: Locator) -> None:
 
 
 @contextmanager
-def nobody_listens(port: int) -> Iterator[None]:
-    """Reserve a port that has just been closed, so that no other process gets it; the test may
-    listen on it again."""
+def nobody_listens(port: int = 0) -> Iterator[int]:
+    """Reserve a port that has just been closed, or any free one, so that no other process gets it;
+    the test may listen on it."""
     with socket.socket() as placeholder:
         placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         placeholder.bind(("127.0.0.1", port))
-        yield
+        yield int(placeholder.getsockname()[1])
 
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
@@ -205,10 +250,65 @@ async def _chromium() -> AsyncIterator[Browser]:
         await launched.close()
 
 
+@dataclass
+class KeptWindow:
+    """A window that stays open for the next test: most of what a new one costs is its process."""
+
+    tab: Tab | None = None
+    taken: bool = False
+
+    async def empty(self) -> None:
+        """Make it a new user's again: leave the page for an empty one of its origin, and forget
+        what the page has stored there."""
+        if self.tab is None or not self.taken or self.tab.is_closed():
+            return
+        context = self.tab.context
+        await self.tab.unroute_all()
+        for other in context.pages:
+            if other is not self.tab:
+                await other.close()
+        async with self.tab.expect_navigation(url="blob:**"):
+            await self.tab.evaluate("location.replace(URL.createObjectURL(new Blob()))")
+        await self.tab.evaluate("localStorage.clear(); sessionStorage.clear()")
+        await context.clear_cookies()
+        await self.tab.mouse.move(0, 0)
+        errors_of(self.tab).clear()
+        self.taken = False
+
+
+kept = KeptWindow()
+
+
+async def new_window(browser: Browser, theme: Literal["light", "dark"] = "light") -> Tab:
+    """Return an empty window of a new user: the kept one, or another one if the test has it."""
+    if kept.tab is not None and not kept.taken:
+        kept.taken = True
+        await kept.tab.set_viewport_size(SIZE)
+        await kept.tab.emulate_media(color_scheme=theme, reduced_motion="no-preference")
+        return kept.tab
+    context = await browser.new_context(
+        viewport=SIZE, color_scheme=theme, reduced_motion="no-preference"
+    )
+    context.set_default_timeout(PATIENCE_MS)
+    tab = await context.new_page()
+    errors_of(tab)
+    if kept.tab is None:
+        kept.tab, kept.taken = tab, True
+    return tab
+
+
 @pytest_asyncio.fixture(loop_scope="session")
-async def browser(_chromium: Browser) -> AsyncIterator[Browser]:
+async def browser(_chromium: Browser, request: pytest.FixtureRequest) -> AsyncIterator[Browser]:
     """The browser. Its windows are closed after each test: one that is left open paints during all
-    later tests of this process."""
+    later tests of this process. One is kept, empty, unless the test has failed."""
+    failed = request.session.testsfailed
     yield _chromium
-    for context in _chromium.contexts:
-        await context.close()
+    try:
+        if request.session.testsfailed == failed:
+            await kept.empty()
+    finally:
+        if kept.taken:
+            kept.tab, kept.taken = None, False
+        for context in _chromium.contexts:
+            if kept.tab is None or context is not kept.tab.context:
+                await context.close()

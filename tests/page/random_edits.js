@@ -1,9 +1,9 @@
 // Random edits of every kind to a document, each undone and done again; run in the page by test_designer.py.
 async ([seed, steps, document]) => {
-  const { Model } = await import("/page/js/design/model.js");
-  const { clip, paste } = await import("/page/js/design/clip.js");
-  const { groups, around } = await import("/page/js/design/macros.js");
-  const { arcsOf } = await import("/page/js/design/arcs.js");
+  const { Model } = await own("design/model.js");
+  const { clip, paste } = await own("design/clip.js");
+  const { groups, around } = await own("design/macros.js");
+  const { arcsOf } = await own("design/arcs.js");
   let state = seed;
   const random = (n) => (state = (state * 1103515245 + 12345) % 2147483648) % n;
   const model = new Model(() => {});

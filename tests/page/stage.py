@@ -51,7 +51,7 @@ from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
 from petrobot.services.comm.protocol.messages import Feedback
 
-BEAT_S = 0.02
+BEAT_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,26 +8,30 @@ import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Literal, Protocol
 
-from playwright.async_api import Browser, Locator, Route, ViewportSize, expect
+from playwright.async_api import Browser, Locator, Route, expect
 from playwright.async_api import Page as Tab
 
 from petrobot.coordinator.page.server import Page
-from tests.page.conftest import PATIENCE_MS, note_toasts
+from tests.page.conftest import PATIENCE_MS, new_window, note_toasts
 
-Watch = Callable[[Any], list[str]]
-SIZE: Final[ViewportSize] = {"width": 1440, "height": 900}
+Watch = Callable[[Tab], list[str]]
 expect.set_options(timeout=PATIENCE_MS)
 
 
-async def opened(browser: Browser, page: Page, theme: Literal["light", "dark"] = "light") -> Tab:
+class Address(Protocol):
+    """What serves the page."""
+
+    @property
+    def url(self) -> str:
+        """Its address, with the token."""
+        ...
+
+
+async def opened(browser: Browser, page: Address, theme: Literal["light", "dark"] = "light") -> Tab:
     """Open the page in a new window, as a new user."""
-    context = await browser.new_context(
-        viewport=SIZE, color_scheme=theme, reduced_motion="no-preference"
-    )
-    context.set_default_timeout(PATIENCE_MS)
-    tab = await context.new_page()
+    tab = await new_window(browser, theme)
     await tab.goto(page.url)
     await expect(tab.get_by_role("button", name="Emergency stop")).to_be_visible()
     await note_toasts(tab)

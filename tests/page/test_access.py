@@ -6,8 +6,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
+import re
 import resource
+import shutil
 import socket
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -16,7 +19,7 @@ import pytest
 from petrobot.coordinator.operator.port import PROTOCOL
 from petrobot.coordinator.page import requests
 from petrobot.coordinator.page.access import CONNECTIONS, HEADERS, ConnectionLimit
-from petrobot.coordinator.page.server import CLIENTS, Page, start_page
+from petrobot.coordinator.page.server import CLIENTS, KEPT, PAGE_FILES, Page, start_page
 from petrobot.coordinator.page.sessions import LARGEST_MESSAGE
 from tests.page.stage import Stage
 from tests.waiting import beat
@@ -55,8 +58,8 @@ def bearer(page: Page) -> dict[str, str]:
 
 PATHS = (
     "/",
-    "/page/index.html",
-    "/page/js/main.js",
+    "/page/1/index.html",
+    "/page/1/js/main.js",
     "/api/tasks",
     "/api/snapshot",
     "/api/live",
@@ -146,7 +149,7 @@ async def test_a_browser_without_origin_cannot_change_anything(page: Page) -> No
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
-@pytest.mark.parametrize("path", ["/", "/api/snapshot", "/page/js/main.js"])
+@pytest.mark.parametrize("path", ["/", "/api/snapshot", "/page/1/js/main.js"])
 async def test_requests_caused_by_other_sites_are_refused(page: Page, site: str, path: str) -> None:
     """Links, images and scripts of another site cannot load anything from this server."""
     assert (await ask(page, path, cookie=True, headers={"Sec-Fetch-Site": site})).status == 403
@@ -165,7 +168,14 @@ async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
 
 @pytest.mark.parametrize(
     "path",
-    ["/page/../server.py", "/page/%2e%2e/server.py", "/page/..%2fserver.py", "/page//etc/passwd"],
+    [
+        f"/page/{path}"
+        for path in (
+            *("../server.py", "1/../../server.py", "%2e%2e/server.py", "1/%2e%2e/server.py"),
+            *("1/..%2fserver.py", "1/js/..%2f..%2fserver.py", "1//etc/passwd", "1/%2fetc%2fpasswd"),
+            *("/etc/passwd", "1/%00", "1/js", "1/js/", "1/", "1", "js/main.js"),
+        )
+    ],
 )
 async def test_files_outside_the_page_are_not_served(page: Page, path: str) -> None:
     """Paths cannot leave the page's folder."""
@@ -203,23 +213,53 @@ async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
 
 async def test_every_answer_carries_the_headers(page: Page) -> None:
     """Pages, data and refusals have a strict content policy, and forbid sniffing, framing,
-    referrers and caches: after an update a browser mixed the scripts of two versions."""
+    referrers and caches, except of files, whose address names their version."""
     assert HEADERS["Cache-Control"] == "no-store"
     for path, headers in (
         ("/", bearer(page)),
-        ("/page/js/main.js", bearer(page)),
+        ("/page/1/js/main.js", bearer(page)),
+        ("/page/1/js/nothing.js", bearer(page)),
         ("/api/tasks", bearer(page)),
         ("/nowhere", bearer(page)),
+        ("/page/1/js/main.js", {}),
         ("/", {}),
     ):
         response = await ask(page, path, headers=headers)
-        assert {name: response.headers.get(name) for name in HEADERS} == HEADERS
+        kept = {"Cache-Control": KEPT} if response.ok and path.startswith("/page/") else {}
+        assert {name: response.headers.get(name) for name in HEADERS} == {**HEADERS, **kept}
     policy = HEADERS["Content-Security-Policy"]
     assert (
         "unsafe" not in policy
         and "default-src 'none'" in policy
         and "frame-ancestors 'none'" in policy
     )
+
+
+async def test_a_changed_file_has_a_new_address(
+    page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Browsers keep the files of the page for good. After an update, also under a running server,
+    they mix no scripts of two versions: all addresses are new."""
+    files = tmp_path.resolve() / "static"
+    shutil.copytree(PAGE_FILES, files)
+    monkeypatch.setattr("petrobot.coordinator.page.server.PAGE_FILES", files)
+
+    async def addresses() -> set[str]:
+        async with aiohttp.ClientSession(headers=bearer(page)) as http:
+            front = await (await http.get(base(page) + "/")).text()
+            found = set(re.findall(r'(?:src|href)="([^"]+)"', front))
+            for path in found:
+                assert (await http.get(base(page) + path)).status == 200
+        return found
+
+    before = await addresses()
+    assert await addresses() == before
+    with (files / "js" / "state.js").open("a") as file:
+        file.write("// another version")
+    after = await addresses()
+    assert len(after) == len(before) > 4 and not after & before
+    (files / "js" / "state.js").rename(files / "js" / "status.js")
+    assert not await addresses() & (before | after)
 
 
 async def test_a_thousand_sockets_do_not_block_the_operator(page: Page) -> None:
@@ -311,7 +351,8 @@ async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/page/index.html", "/page/js/main.js", "/api/tasks", "/api/runs", "/api/check"]
+    "path",
+    ["/", "/page/1/index.html", "/page/1/js/main.js", "/api/tasks", "/api/runs", "/api/check"],
 )
 async def test_without_the_page_only_the_protocol_is_served(
     stage: Stage, tasks: Any, path: str

@@ -295,7 +295,7 @@ async def test_no_header_gives_the_token_away(page: Page) -> None:
     )
     assert first.headers["Location"] == "/"
     headers = {"Referer": f"{base(page)}/?token={page.token}"}
-    for path in ("/", "/api/snapshot", "/page/js/main.js"):
+    for path in ("/", "/api/snapshot", "/page/1/js/main.js"):
         assert (await ask(page, path, headers=headers)).status == 401
 
 

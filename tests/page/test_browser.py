@@ -28,6 +28,7 @@ from tests.page.conftest import (
     PATIENCE_MS,
     abort,
     browser_missing,
+    kept,
     nobody_listens,
     served,
     toasted,
@@ -115,6 +116,37 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
         "the part slipped out of the gripper"
     )
     await tab.screenshot(path=shots / "why.png")
+
+
+async def test_the_window_of_the_test_before_is_that_of_a_new_user(
+    browser: Browser, page: Page, faults: Watch
+) -> None:
+    """Nothing is left of its drawing, its colours, its routes, its errors or who it was."""
+    for _ in range(2):
+        tab = await opened(browser, page)
+        assert tab is kept.tab and faults(tab) == []
+        assert await tab.evaluate("[innerWidth, localStorage['petrobot.theme']]") == [1440, "light"]
+        assert await tab.evaluate("[Object.keys(localStorage).length, sessionStorage.length]") == [
+            2,
+            0,
+        ]
+        await hold_controls(tab)
+        await tab.get_by_role("button", name="Release").click()
+        await tab.get_by_role("tab", name="Design").click()
+        await settled(tab)
+        await expect(tab.locator(".saved")).to_have_text("saved")
+        await element(tab, "^Action place pick").click()
+        await tab.keyboard.press("Delete")
+        await expect(element(tab, "^Action place pick")).to_have_count(0)
+        await tab.get_by_role("button", name="Dark colours").click()
+        await tab.evaluate("localStorage.other = sessionStorage.other = 'left'")
+        await tab.evaluate("console.error('left')")
+        await until(lambda: faults(tab) == ["left"])  # noqa: B023
+        await tab.route("**/*", lambda route: route.abort())
+        await tab.set_viewport_size({"width": 800, "height": 600})
+        await tab.context.new_page()
+        await kept.empty()
+        assert tab.context.pages == [tab] and await tab.context.cookies() == []
 
 
 async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
@@ -247,7 +279,7 @@ async def test_what_a_short_form_adds_has_a_name_for_people(browser: Browser, pa
         ],
     }
     script = """async (task) => {
-      const { labelsOf } = await import("/page/js/sheet.js");
+      const { labelsOf } = await own("sheet.js");
       return Object.fromEntries(labelsOf(task));
     }"""
     labels = await tab.evaluate(script, task)
@@ -260,9 +292,9 @@ async def test_live_and_design_draw_the_same_net(browser: Browser, page: Page) -
     flat net of a run, the other from the file."""
     tab = await opened(browser, page)
     script = """async ([picture, file]) => {
-      const { sheetOf } = await import("/page/js/sheet.js");
-      const { drawn } = await import("/page/js/design/drawn.js");
-      const { placed } = await import("/page/js/layout.js");
+      const { sheetOf } = await own("sheet.js");
+      const { drawn } = await own("design/drawn.js");
+      const { placed } = await own("layout.js");
       const seen = (e) => [e.name, [e.x, e.y, e.sub, Boolean(e.error)]];
       const joins = (a) => [a.direction, a.place, a.end ?? "", a.transition, a.weight].join(" ");
       const told = ({ places, transitions, arcs }) => [
@@ -275,6 +307,46 @@ async def test_live_and_design_draw_the_same_net(browser: Browser, page: Page) -
         task = json.loads(json.dumps(picture(loads(text))))
         live, design = await tab.evaluate(script, [task, tomllib.loads(text)])
         assert live == design, task["name"]
+
+
+TICKS = """() => {
+  const observer = new MutationObserver(() => {});
+  const all = { attributes: true, characterData: true, childList: true, subtree: true };
+  observer.observe(document, all);
+  for (let tick = 0; tick < 20; tick += 1) petrobot.tick();
+  return observer.takeRecords().map((m) => m.attributeName ?? m.target.nodeName);
+}"""
+BEAT = """() => {
+  const { now } = performance;
+  performance.now = () => 800;
+  petrobot.tick();
+  performance.now = now;
+  return document.documentElement.dataset.beat;
+}"""
+SHADE = "getComputedStyle(document.querySelector('.banner .state'), '::before').opacity"
+
+
+async def test_a_page_at_which_nothing_happens_is_not_drawn_again(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """It stays open for days. Its ticks change nothing while the state is the same, and what blinks
+    is no endless animation, for which a browser draws sixty times a second. Nothing blinks for
+    people who want no motion."""
+    tab = await opened(browser, page)
+    await expect(tab.get_by_role("button", name="Take controls")).to_be_visible()
+    await tab.evaluate(TICKS)
+    assert set(await tab.evaluate(TICKS)) <= {"data-beat"}
+    stage.kept.add("clear")
+    await start_mission(tab)
+    stage.happen("part_there")
+    await expect(tab.locator(".net [data-name=pick] .mark.alarm")).to_be_visible()
+    for shade in ("0.3", "1", "0.3"):
+        await tab.wait_for_function(f"() => {SHADE} === '{shade}'")
+    endless = "document.getAnimations().filter((a) => a.effect.getTiming().iterations > 9).length"
+    assert await tab.evaluate(endless) == 0
+    assert await tab.evaluate(BEAT) == "off"
+    await tab.emulate_media(reduced_motion="reduce")
+    assert await tab.evaluate(BEAT) == "on"
 
 
 async def test_firings_of_another_run_are_not_taken_for_those_shown(
@@ -548,7 +620,7 @@ async def test_history(
     )
     await scrub.get_by_role("button", name="Previous error").click()
     await tab.screenshot(path=shots / "history.png")
-    said = "(text) => import('/page/js/toast.js').then((m) => m.toast('error', text))"
+    said = "(text) => own('toast.js').then((m) => m.toast('error', text))"
     await tab.evaluate(said, "Refused: another run is active")
     toast, bar = await tab.locator(".toast").last.bounding_box(), await scrub.bounding_box()
     assert toast is not None and bar is not None
@@ -619,7 +691,7 @@ async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, 
     random sequences of changes."""
     tab = await opened(browser, page)
     script = """async ([state, changes]) => {
-      const { apply } = await import("/page/js/state.js");
+      const { apply } = await own("state.js");
       for (const change of changes) apply(state, change);
       return state;
     }"""

@@ -25,7 +25,8 @@ from tests.drawing.conftest import random_task
 from tests.page.conftest import (
     PATIENCE_MS,
     browser_missing,
-    is_fault,
+    errors_of,
+    new_window,
     note_toasts,
     toasted,
 )
@@ -49,21 +50,14 @@ async def designing(
     browser: Browser, page: Page, task: str = "pick_and_place"
 ) -> tuple[Tab, list[str]]:
     """Open the designer with a task; also return the list of errors in its window."""
-    context = await browser.new_context(viewport={"width": 1440, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
-    tab = await context.new_page()
-    complaints: list[str] = []
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.on(
-        "console", lambda message: complaints.append(message.text) if is_fault(message) else None
-    )
+    tab = await new_window(browser)
     await tab.goto(f"{page.url}#design")
     await settled(tab)
     await expect(tab.get_by_label("Task", exact=True)).to_have_value("pick_and_place")
     await note_toasts(tab)
     if task != "pick_and_place":
         await open_task(tab, task)
-    return tab, complaints
+    return tab, errors_of(tab)
 
 
 async def open_task(tab: Tab, task: str) -> None:
@@ -484,7 +478,7 @@ async def test_the_page_has_the_same_layout_as_the_command_line(
     positions; also long ones, which are folded, with resources beside their layers."""
     tab, _ = await designing(browser, page)
     script = """async ([names, edges, sources, aside]) => {
-      const { layered } = await import("/page/js/layers.js");
+      const { layered } = await own("layers.js");
       return layered(names, edges, sources, aside);
     }"""
     for names, edges, sources, aside in [*map(short_net, range(12)), *map(long_net, range(6))]:
@@ -600,10 +594,8 @@ COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8
 async def test_labels_on_the_page_cover_nothing(browser: Browser, page: Page, tasks: Path) -> None:
     """Measured in the browser on random nets laid out by the page: no label covers a label or an
     element, and few arcs cross labels."""
-    tab, _ = await designing(browser, page)
-    total: Counter[str] = Counter()
-    for seed in range(40, 45):
-        net = random_task(np.random.default_rng(seed), 3)
+    nets = {f"random_{seed}": random_task(np.random.default_rng(seed), 3) for seed in range(40, 45)}
+    for name, net in nets.items():
         arcs = [
             f"in = {[net.places[p] for p, _ in net.consume[t]]}\nout = "
             f"{[net.places[p] for p, _ in net.produce[t]]}\n"
@@ -617,11 +609,11 @@ async def test_labels_on_the_page_cover_nothing(browser: Browser, page: Page, ta
         text += "".join(
             f"[transitions.{t}]\n{a}" for t, a in zip(net.transitions, arcs, strict=True)
         )
-        (tasks / f"random_{seed}.toml").write_text(text)
-        await tab.reload()
-        await settled(tab)
-        await expect(tab.locator(".saved")).to_have_text("saved")
-        await open_task(tab, f"random_{seed}")
+        (tasks / f"{name}.toml").write_text(text)
+    tab, _ = await designing(browser, page)
+    total: Counter[str] = Counter()
+    for name, net in nets.items():
+        await open_task(tab, name)
         await expect(element(tab, "^Transition ")).to_have_count(len(net.transitions))
         total.update(await tab.evaluate(COVERED))
     assert total["words"] > 80

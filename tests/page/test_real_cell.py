@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from tests.page.conftest import PATIENCE_MS, abort, browser_missing, note_toasts, toasted
+from tests.page.conftest import abort, browser_missing, toasted
 
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
@@ -24,7 +24,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, expect
 from playwright.async_api import Page as Tab
 
-from tests.page.steps import SIZE, Watch, checked, draw_the_task, element, hold_controls, settled
+from tests.page.steps import Watch, checked, draw_the_task, element, hold_controls, opened, settled
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -117,47 +117,34 @@ async def served(tmp_path: Path) -> AsyncIterator[Served]:
         yield made
 
 
-@asynccontextmanager
-async def window(browser: Browser, served: Served, theme: str = "light") -> AsyncIterator[Tab]:
-    """Open the page in a new window, as a new user."""
-    context = await browser.new_context(viewport=SIZE, color_scheme=theme)  # type: ignore[arg-type]
-    context.set_default_timeout(PATIENCE_MS)
-    tab = await context.new_page()
-    await tab.goto(served.url)
-    await expect(tab.get_by_role("button", name="Emergency stop")).to_be_visible()
-    await note_toasts(tab)
-    yield tab
-    await context.close()
-
-
 async def test_a_new_user_draws_a_task_and_runs_it_on_the_cell(
     browser: Browser, served: Served, shots: Path, faults: Watch
 ) -> None:
     """All on real nodes: draw, start, pause, step, run once more, find out why it failed, start
     again, look at the history, quit."""
-    async with window(browser, served) as tab:
-        complaints = faults(tab)
-        await expect(tab.get_by_role("region", name="Nodes")).to_contain_text("2 of 2 up")
-        await hold_controls(tab)
-        await tab.screenshot(path=shots / "serve-idle.png")
-        await tab.get_by_role("tab", name="Design").click()
-        await settled(tab)
-        await tab.get_by_role("button", name="New task").click()
-        await draw_the_task(tab)
-        await checked(tab)
-        await tab.get_by_role("button", name="Run this task").click()
-        dialog = tab.get_by_role("dialog", name="Save the task as")
-        await dialog.get_by_label("Name").fill("drawn")
-        await dialog.get_by_role("button", name="OK").click()
-        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
-        assert (served.folder / "tasks" / "drawn.toml").exists()
-        await lead_by_hand(tab, shots)
-        await start_again(tab, shots)
-        await look_back(tab, shots)
-        assert complaints == []
-        assert await served.end() == 0
-        await expect(tab.get_by_role("alert")).to_contain_text("has shut down normally")
-        await tab.screenshot(path=shots / "serve-goodbye.png")
+    tab = await opened(browser, served)
+    complaints = faults(tab)
+    await expect(tab.get_by_role("region", name="Nodes")).to_contain_text("2 of 2 up")
+    await hold_controls(tab)
+    await tab.screenshot(path=shots / "serve-idle.png")
+    await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
+    await tab.get_by_role("button", name="New task").click()
+    await draw_the_task(tab)
+    await checked(tab)
+    await tab.get_by_role("button", name="Run this task").click()
+    dialog = tab.get_by_role("dialog", name="Save the task as")
+    await dialog.get_by_label("Name").fill("drawn")
+    await dialog.get_by_role("button", name="OK").click()
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
+    assert (served.folder / "tasks" / "drawn.toml").exists()
+    await lead_by_hand(tab, shots)
+    await start_again(tab, shots)
+    await look_back(tab, shots)
+    assert complaints == []
+    assert await served.end() == 0
+    await expect(tab.get_by_role("alert")).to_contain_text("has shut down normally")
+    await tab.screenshot(path=shots / "serve-goodbye.png")
 
 
 async def lead_by_hand(tab: Tab, shots: Path) -> None:
@@ -226,23 +213,23 @@ async def test_the_page_explains_why_a_task_cannot_start(
 ) -> None:
     """A shipped task for which this cell has no nodes is listed and drawn, and its start is refused
     with the reason; the user may edit a copy."""
-    async with window(browser, served, "dark") as tab:
-        await tab.get_by_role("button", name="Take controls").click()
-        toolbar = tab.get_by_role("toolbar", name="Mission")
-        await toolbar.get_by_label("Task to start").select_option("catch_ball")
-        await expect(element(tab, "^Action place locate_ball", "Task net")).to_be_visible()
-        await toolbar.get_by_role("button", name="Start", exact=True).click()
-        await toasted(tab, "catch_ball may not run.*no node offers")
-        await tab.screenshot(path=shots / "serve-refused.png")
-        await tab.get_by_role("tab", name="Design").click()
-        await settled(tab)
-        await expect(tab.get_by_text("shipped, saving makes your copy")).to_be_visible()
-        await tab.get_by_label("Goal", exact=True).fill("mine")
-        await tab.get_by_label("Goal", exact=True).press("Enter")
-        await tab.get_by_role("button", name="Save").click()
-        await expect(tab.get_by_label("Task", exact=True).locator("option:checked")).to_have_text(
-            "catch ball (my copy)"
-        )
-        assert 'goal = "mine"' in (served.folder / "tasks" / "catch_ball.toml").read_text(
-            encoding="utf-8"
-        )
+    tab = await opened(browser, served, "dark")
+    await tab.get_by_role("button", name="Take controls").click()
+    toolbar = tab.get_by_role("toolbar", name="Mission")
+    await toolbar.get_by_label("Task to start").select_option("catch_ball")
+    await expect(element(tab, "^Action place locate_ball", "Task net")).to_be_visible()
+    await toolbar.get_by_role("button", name="Start", exact=True).click()
+    await toasted(tab, "catch_ball may not run.*no node offers")
+    await tab.screenshot(path=shots / "serve-refused.png")
+    await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
+    await expect(tab.get_by_text("shipped, saving makes your copy")).to_be_visible()
+    await tab.get_by_label("Goal", exact=True).fill("mine")
+    await tab.get_by_label("Goal", exact=True).press("Enter")
+    await tab.get_by_role("button", name="Save").click()
+    await expect(tab.get_by_label("Task", exact=True).locator("option:checked")).to_have_text(
+        "catch ball (my copy)"
+    )
+    assert 'goal = "mine"' in (served.folder / "tasks" / "catch_ball.toml").read_text(
+        encoding="utf-8"
+    )

@@ -78,7 +78,7 @@ export class Link {
   /** A browser does not learn why its WebSocket was refused; a plain request shows whether the key is the reason. */
   async askWhy() {
     try {
-      const { status } = await fetch("/page/icon.svg", { method: "HEAD", cache: "no-store" });
+      const { status } = await fetch(new URL("../icon.svg", import.meta.url), { method: "HEAD", cache: "no-store" });
       this.refused = status === UNKNOWN_HERE;
     } catch {
       this.refused = false; // no answer at all

@@ -10,11 +10,14 @@ import { Banner, Operator } from "./operator.js";
 import { toast } from "./toast.js";
 
 const TICK_MS = 100;
+const BEAT_MS = 800; // of what blinks while it lasts; an endless animation would draw sixty times a second
 const PATIENCE_MS = 2000; // a page that has just been opened may still be on its way
 const LOST = "Connection to the coordinator lost. What you see is old. Trying again …";
 const NEVER = "Not connected to the coordinator yet. Nothing on this page shows its real state. Trying again …";
 const ENDED = "This coordinator has shut down normally. This page no longer reaches its nodes or their emergency stop. What you see is its last state.";
 const REFUSED = "The coordinator was restarted and has a new key, so it refuses this page. What you see is old. Open the address that it printed when it started, in this browser or here:";
+
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
 class App {
   constructor(root) {
@@ -103,6 +106,7 @@ class App {
     this.lost.update();
     const now = this.link.now();
     this.banner.tick(now);
+    attribute(document.documentElement, "data-beat", !calm.matches && Math.floor(performance.now() / BEAT_MS) % 2 ? "off" : "on");
     if (this.shown === "Live") this.tabs.Live.tick(now);
   }
 }
@@ -132,9 +136,9 @@ class LostBar {
     const { reason } = this;
     const { connected, goodbye, refused } = this.link;
     const calm = goodbye && !refused;
-    this.root.hidden = !reason;
+    attribute(this.root, "hidden", reason ? null : ""); // `hidden =` would lay out at each tick
     text(this.text, reason);
-    this.form.hidden = !refused;
+    attribute(this.form, "hidden", refused ? null : "");
     attribute(this.root, "data-ended", calm ? "" : null);
     attribute(document.documentElement, "data-connected", connected ? "yes" : calm ? "ended" : "no");
   }
