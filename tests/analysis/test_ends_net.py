@@ -242,3 +242,10 @@ def test_a_task_grows_only_if_the_engine_shows_it(
     if bounded is False:
         assert said.witness is not None and said.witness.loop
         assert "can grow without bound" in said.reason
+
+
+def test_growth_that_an_end_may_stop_is_unknown() -> None:
+    """How far a place can grow that the end compares with another place, no repetition shows."""
+    text = GLANCES.replace("seen >= 0", "seen >= right")
+    found = analyse(loads(text, "t.toml"), steps=200)
+    assert found.verdicts()["bounded"].holds is None and "bounded" not in found.objections

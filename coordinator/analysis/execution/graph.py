@@ -13,7 +13,6 @@ the beginning, so that a dead end far away is found.
 
 from __future__ import annotations
 
-import re
 from bisect import bisect
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -31,6 +30,7 @@ from petrobot.coordinator.analysis.execution.names import (
     Names,
     Orders,
     TooManyValues,
+    literals_of,
 )
 from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
@@ -229,11 +229,16 @@ class ExecutionGraph:
 
     @cached_property
     def _most(self) -> list[int]:
-        """By place: more tokens than this change nothing that the engine tests."""
+        """By place: more tokens than this change nothing that the engine tests. Of a place that an
+        end compares with another place, no number is enough."""
         net, task = self.engine.compiled.net, self.engine.compiled.task
-        asked = [int(n) for n in re.findall(r"\d+", f"{task.final} {task.final_error}")]
+        ends = [end for end in (task.final, task.final_error) if end is not None]
+        literals, together = literals_of(ends)
         most = [
-            max(asked, default=0) + (capacity or 0) + task.places[name].most_active
+            max(map(int, literals.get(name, [])), default=0)
+            + (REPEATS if name in together else 0)
+            + (capacity or 0)
+            + task.places[name].most_active
             for name, capacity in zip(net.places, net.capacity, strict=True)
         ]
         for arcs in (*net.consume, *net.produce, *net.inhibit):

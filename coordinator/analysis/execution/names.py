@@ -83,7 +83,7 @@ class Names:
         parameters = dict(task.parameters)
         fixed = [with_values(c, parameters) for c in conditions]
         self._values = region_values(fixed, compiled.domains)
-        self._literals, self._together = _compared(fixed)
+        self._literals, self._together = literals_of(fixed)
         self.asked = {field: set[str]() for field in RUN_FIELDS}
         """By property of a run that a condition reads: the places whose ended runs it
         distinguishes, because an arc that takes them reads it."""
@@ -142,7 +142,7 @@ class Names:
         takers = [dict(x.needs)[p] for x in compiled.transitions if p in dict(x.needs)]
         barred = any(p in dict(x.bars) for x in compiled.transitions)
         ends = [c for c in (task.final, task.final_error) if c is not None]
-        literals, together = _compared(ends)
+        literals, together = literals_of(ends)
         asked = literals.get(task.runs_place, [])
         few = takers == [1] and not barred and set(asked) <= {0} and task.runs_place not in together
         return p if few else None
@@ -432,7 +432,7 @@ def _run_names(task: Any) -> set[str]:
     return {f"{p}.{field}" for p in places for field in RUN_FIELDS}
 
 
-def _compared(conditions: list[Any]) -> tuple[dict[str, list[Any]], set[str]]:
+def literals_of(conditions: list[Any]) -> tuple[dict[str, list[Any]], set[str]]:
     """Return the literals that each name is compared with, and the names that are compared with
     other names."""
     literals: dict[str, list[Any]] = {}
