@@ -90,9 +90,9 @@ class Turns:
         options = ["--runs", "100000", "--no-page", "--quiet", *more]
         return petrobot("run", str(self.task(pause)), *options, *self._services, *self._journal)
 
-    def resume(self, run: Path, **variables: str) -> subprocess.Popen[str]:
-        """Resume a run, with these environment variables."""
-        return petrobot("resume", str(run), "--no-page", "--quiet", **variables)
+    def resume(self, run: Path) -> subprocess.Popen[str]:
+        """Resume a run."""
+        return petrobot("resume", str(run), "--no-page", "--quiet")
 
     def serve(self) -> subprocess.Popen[str]:
         """Serve the page."""
@@ -107,6 +107,14 @@ class Turns:
         """Wait until two more runs have moved a hand."""
         enough = self.begun() + 2
         await until(lambda: self.begun() >= enough, "hands that move")
+
+    async def moved(self, coordinator: subprocess.Popen[str]) -> None:
+        """Wait until a coordinator moves the hands, and kill it."""
+        try:
+            await self.moving()
+        finally:
+            coordinator.kill()
+            coordinator.communicate()
 
     async def estop(self, *options: str) -> None:
         """Give `petrobot estop`, whose devices all obey."""
@@ -224,12 +232,7 @@ async def test_a_run_whose_devices_another_one_has_used_moves_nothing_more(turns
     finally:
         coordinator.kill()
         coordinator.communicate()
-    coordinator = turns.resume(run)
-    try:
-        await turns.moving()
-    finally:
-        coordinator.kill()
-        coordinator.communicate()
+    await turns.moved(turns.resume(run))
 
 
 @pytest.mark.parametrize("command", ["run", "resume"])
@@ -237,17 +240,23 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     turns: Turns, command: str
 ) -> None:
     """The coordinator is frozen before it has reached any node, even before it is Python. The
-    operator must order it again, and then it moves."""
+    operator must order it again, and then it moves. So does a run from before the stop whose
+    coordinator was killed: to resume it is a decision of the operator."""
     run = Path()
     if command == "resume":
         coordinator = turns.start(1.5)
         run = await turns.connected(coordinator)
         coordinator.kill()
         coordinator.communicate()
+        await turns.estop()
+        await turns.estop("--clear")
+        assert turns.begun() == 0
+        await turns.moved(turns.resume(run))
 
     def order() -> subprocess.Popen[str]:
         return turns.resume(run) if command == "resume" else turns.start(0.02)
 
+    then = turns.begun()
     for moment in (0.0, 0.1, 0.3) if command == "run" else (0.1,):
         coordinator = order()
         try:
@@ -258,38 +267,37 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
             await turns.estop("--clear")
             coordinator.send_signal(signal.SIGCONT)
             code, out, err = await finished(coordinator)
-            assert (code, turns.begun()) == (1, 0), out + err
+            assert (code, turns.begun()) == (1, then), out + err
             assert "order it again" in err
         finally:
             coordinator.kill()
             coordinator.communicate()
-    coordinator = order()
-    try:
-        await turns.moving()
-    finally:
-        coordinator.kill()
-        coordinator.communicate()
+    await turns.moved(order())
 
 
-async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns: Turns) -> None:
+async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(
+    turns: Turns, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exit code 2, and nothing moves, whether the host of the coordinator knows of the stop or only
     the node."""
     coordinator = turns.start(0.02)
     run = await turns.connected(coordinator)
-    await turns.moving()
-    coordinator.kill()
-    coordinator.communicate()
+    await turns.moved(coordinator)
+    resume = ["resume", str(run), "--no-page", "--quiet"]
     await turns.estop()
     then = turns.begun()
-    for variables in ({}, {"PETROBOT_STATE": str(turns.folder / "another host")}):
-        code, out, err = await finished(turns.resume(run, **variables))
-        assert (code, turns.begun()) == (2, then) and "petrobot estop --clear" in err, out + err
+    with pytest.MonkeyPatch.context() as patch:
+        for host in (None, turns.folder / "another host"):
+            if host is not None:
+                patch.setenv("PETROBOT_STATE", str(host))
+            assert await asyncio.to_thread(main, resume) == 2
+            assert "petrobot estop --clear" in capsys.readouterr().err and turns.begun() == then
     await turns.estop("--clear")
     other = turns.start(0.5)
     try:
         await turns.connected(other)
-        code, out, err = await finished(turns.resume(run))
-        assert code == 2 and "in use: left_hand accepts orders from" in err, out + err
+        assert await asyncio.to_thread(main, resume) == 2
+        assert "in use: left_hand accepts orders from" in capsys.readouterr().err
     finally:
         other.kill()
         other.communicate()
@@ -377,20 +385,3 @@ async def test_a_stop_during_the_preparation_ends_the_run(tmp_path: Path) -> Non
         finally:
             coordinator.kill()
             coordinator.communicate()
-
-
-async def test_a_run_that_is_resumed_after_the_stop_moves(turns: Turns) -> None:
-    """Its coordinator was killed between two runs. To resume it is a decision of the operator."""
-    coordinator = turns.start(1.5)
-    try:
-        run = await turns.connected(coordinator)
-        coordinator.kill()
-        coordinator.communicate()
-        await turns.estop()
-        await turns.estop("--clear")
-        assert turns.begun() == 0
-        coordinator = turns.resume(run)
-        await turns.moving()
-    finally:
-        coordinator.kill()
-        coordinator.communicate()
