@@ -631,33 +631,6 @@ def test_the_skeletons_of_new_work(tmp_path: Path) -> None:
     assert petrobot("new", "task", "greet", cwd=tmp_path).returncode == 2
 
 
-@pytest.mark.processes
-def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
-    """It has the keys that scripts rely on. That the same seed gives the same file, wherever the
-    nodes run, is shown by tests/integration/test_lockstep_cell.py."""
-    path = tmp_path / "result.json"
-    arguments = ("catch_ball", "--mode", "lockstep", "--runs", "2", "--seed", "1")
-    done = petrobot("run", *arguments, "--json", str(path), "--quiet")
-    assert done.returncode == 0, done.stderr
-    result = json.loads(path.read_text(encoding="utf-8"))
-    assert {
-        "task",
-        "mode",
-        "seed",
-        "regime",
-        "runs",
-        "caught",
-        "throws",
-        "wall_s",
-        "sim_s",
-        "firings",
-    } <= set(result)
-    assert all(
-        {"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in result["throws"]
-    )
-    assert len(result["throws"]) == 2
-
-
 PRESSING = """\
 from petrobot.services.action import error, success
 

@@ -82,6 +82,14 @@ def usual(shared: Callable[..., Path]) -> dict[str, Any]:
     return result
 
 
+def test_the_result_has_the_keys_that_scripts_rely_on(usual: dict[str, Any]) -> None:
+    """And `wall_s`, which `run` has taken out."""
+    keys = {"task", "mode", "seed", "regime", "runs", "caught", "throws", "sim_s", "firings"}
+    assert keys <= set(usual) and usual["runs"] == 1
+    (throw,) = usual["throws"]
+    assert {"n", "speed", "caught", "miss_mm", "status"} <= set(throw)
+
+
 @pytest.mark.processes
 def test_a_process_per_node_and_a_third_node_change_nothing(
     usual: dict[str, Any], tmp_path: Path

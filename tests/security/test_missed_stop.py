@@ -90,9 +90,9 @@ class Turns:
         options = ["--runs", "100000", "--no-page", "--quiet", *more]
         return petrobot("run", str(self.task(pause)), *options, *self._services, *self._journal)
 
-    def resume(self, run: Path) -> subprocess.Popen[str]:
-        """Resume a run."""
-        return petrobot("resume", str(run), "--no-page", "--quiet")
+    def resume(self, run: Path, **variables: str) -> subprocess.Popen[str]:
+        """Resume a run, with these environment variables."""
+        return petrobot("resume", str(run), "--no-page", "--quiet", **variables)
 
     def serve(self) -> subprocess.Popen[str]:
         """Serve the page."""
@@ -275,29 +275,25 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     await turns.moved(order())
 
 
-async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(
-    turns: Turns, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns: Turns) -> None:
     """Exit code 2, and nothing moves, whether the host of the coordinator knows of the stop or only
     the node."""
     coordinator = turns.start(0.02)
     run = await turns.connected(coordinator)
     await turns.moved(coordinator)
-    resume = ["resume", str(run), "--no-page", "--quiet"]
     await turns.estop()
     then = turns.begun()
-    with pytest.MonkeyPatch.context() as patch:
-        for host in (None, turns.folder / "another host"):
-            if host is not None:
-                patch.setenv("PETROBOT_STATE", str(host))
-            assert await asyncio.to_thread(main, resume) == 2
-            assert "petrobot estop --clear" in capsys.readouterr().err and turns.begun() == then
+    another = {"PETROBOT_STATE": str(turns.folder / "another host")}
+    for variables, says in (({}, "still holds the devices"), (another, "left_hand: emergency")):
+        code, out, err = await finished(turns.resume(run, **variables))
+        assert (code, turns.begun()) == (2, then) and says in err, out + err
+        assert "petrobot estop --clear" in err, err
     await turns.estop("--clear")
     other = turns.start(0.5)
     try:
         await turns.connected(other)
-        assert await asyncio.to_thread(main, resume) == 2
-        assert "in use: left_hand accepts orders from" in capsys.readouterr().err
+        code, out, err = await finished(turns.resume(run))
+        assert code == 2 and "in use: left_hand accepts orders from" in err, out + err
     finally:
         other.kill()
         other.communicate()
