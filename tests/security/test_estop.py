@@ -89,12 +89,12 @@ class Cell:
         return petrobot("run", task, "--runs", "3", *services, "--no-page", "--quiet", **variables)
 
     async def estop(self, *options: str) -> tuple[int, Any]:
-        """Give `petrobot estop`; return its exit code and answers."""
-        told = self.folder / "told.json"
+        """Give `petrobot estop`; return its exit code and answers. It is a process, as for the
+        operator: here it would share the interpreter with the listener on the bus."""
         services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
-        command = ["estop", *services, "--json", str(told), *options]
-        code = await asyncio.to_thread(main, command)
-        return code, json.loads(told.read_text())
+        code, out, err = await finished(petrobot("estop", *services, "--json", "-", *options))
+        assert out, err
+        return code, json.loads(out)
 
     async def standing(self) -> None:
         """Wait until the joints have not moved during the time of a braking ramp."""

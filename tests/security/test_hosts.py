@@ -191,9 +191,19 @@ class Guarded:
             }
         return found
 
-    @contextlib.contextmanager
-    def strange_keys(self) -> Iterator[None]:
-        """Put other keys in the place of its own."""
+    def petrobot(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run a command and keep its output."""
+        services = (
+            ["--services", str(self.directory.source)]
+            if arguments[0] in ("run", "nodes", "estop")
+            else []
+        )
+        done = run("petrobot.coordinator", *arguments, *services, cwd=self.folder)
+        self.said += [done.stdout, done.stderr]
+        return done
+
+    def with_strange_keys(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run the same command with other keys."""
         own = [*self.folder.glob("cell.key"), *self.folder.glob("keys/c*.*")]
         kept = {path: path.read_bytes() for path in own}
         for path in own:
@@ -203,7 +213,7 @@ class Guarded:
         else:
             write_key(self.folder / "cell.key", new_key())
         try:
-            yield
+            return self.petrobot(*arguments)
         finally:
             for path, data in kept.items():
                 path.write_bytes(data)
@@ -250,17 +260,11 @@ def _forms(secret: str) -> list[bytes]:
 
 
 @pytest.mark.parametrize("how", ["shared key", "certificates"])
-async def test_a_guarded_cell_works_and_keeps_its_secrets(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    how: str,
-) -> None:
-    """Nodes, run, log and emergency stop work with keys, and no output, log, journal, report,
-    command line or environment shows one."""
+async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: str) -> None:
+    """Nodes, run, log and emergency stop work with keys, and no output, log, journal or report
+    shows one."""
     cell = Guarded(tmp_path, how)
     token: dict[str, str] = {}
-    monkeypatch.chdir(tmp_path)
 
     async def look_for_token(done: asyncio.Future[Any]) -> None:
         limit = Limit("the page's token")
@@ -269,32 +273,32 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(
                 token["page token"] = json.loads(path.read_text())["token"]
             await beat(0.01)
 
-    async def petrobot(*arguments: str) -> int:
-        code = await asyncio.to_thread(main, list(arguments))
-        cell.said += capsys.readouterr()
-        return code
-
     async with Supervisor(local_programs(cell.directory), tmp_path / "logs", respawn=False):
         options = ("--journal", "runs", "--report", "report", "--json", "out.json", "--no-page")
         running = asyncio.ensure_future(
-            asyncio.to_thread(
-                run, "petrobot.coordinator", "run", "sweeping.toml", *options, cwd=tmp_path
-            )
+            asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", *options)
         )
         await look_for_token(running)
         cell.said += _process_list()
         done = await running
-        cell.said += [done.stdout, done.stderr]
         assert done.returncode == 0, done.stderr
         assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
-        for command in ("nodes --json -", "log last --format jsonl", "estop --json -"):
-            assert await petrobot(*command.split()) == 0, command
-        assert await petrobot("estop", "--clear") == 0
-        with cell.strange_keys():
-            assert await petrobot("run", "sweeping.toml", "--no-page", "--quiet") == 3
-        told = cell.said[-1]
-        assert "motion" in told
-        assert ("expected the certificate of" if how == "certificates" else "wrong_key") in told
+        assert (await asyncio.to_thread(cell.petrobot, "nodes", "--json", "-")).returncode == 0
+        assert (
+            await asyncio.to_thread(cell.petrobot, "log", "last", "--format", "jsonl")
+        ).returncode == 0
+        assert (await asyncio.to_thread(cell.petrobot, "estop", "--json", "-")).returncode == 0
+        assert (
+            cell.petrobot("estop", "--clear", "--services", str(cell.directory.source)).returncode
+            == 0
+        )
+        stranger = await asyncio.to_thread(
+            cell.with_strange_keys, "run", "sweeping.toml", "--no-page", "--quiet"
+        )
+        assert stranger.returncode == 3 and "motion" in stranger.stderr
+        assert (
+            "expected the certificate of" if how == "certificates" else "wrong_key"
+        ) in stranger.stderr
     assert token["page token"] and cell.secrets()
     assert list(tmp_path.glob("logs/*.log")) and (tmp_path / "report" / "index.html").exists()
     assert cell.leaks(token) == []
