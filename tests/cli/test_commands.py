@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.analysis import commands
+from petrobot.coordinator.analysis import commands, may_run
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.cli import COMMANDS, Subcommand, loading, main
@@ -631,33 +631,6 @@ def test_the_skeletons_of_new_work(tmp_path: Path) -> None:
     assert petrobot("new", "task", "greet", cwd=tmp_path).returncode == 2
 
 
-@pytest.mark.processes
-def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
-    """It has the keys that scripts rely on. That the same seed gives the same file, wherever the
-    nodes run, is shown by tests/integration/test_lockstep_cell.py."""
-    path = tmp_path / "result.json"
-    arguments = ("catch_ball", "--mode", "lockstep", "--runs", "2", "--seed", "1")
-    done = petrobot("run", *arguments, "--json", str(path), "--quiet")
-    assert done.returncode == 0, done.stderr
-    result = json.loads(path.read_text(encoding="utf-8"))
-    assert {
-        "task",
-        "mode",
-        "seed",
-        "regime",
-        "runs",
-        "caught",
-        "throws",
-        "wall_s",
-        "sim_s",
-        "firings",
-    } <= set(result)
-    assert all(
-        {"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in result["throws"]
-    )
-    assert len(result["throws"]) == 2
-
-
 PRESSING = """\
 from petrobot.services.action import error, success
 
@@ -735,6 +708,8 @@ def test_a_task_may_name_its_own_location_file(
     assert (
         cell_path(None, "catch_ball", load(SHIPPED / "catch_ball.toml")) == ROOT / "services.toml"
     )
+    # Not every state is searched: what `check` finds there does not depend on the folder.
+    monkeypatch.setattr(may_run, "BUDGET", may_run.Budget(markings=50, steps=100))
     assert main(["check", "follow_track"]) == 0
 
 

@@ -12,26 +12,27 @@ from typing import Any
 
 import pytest
 
+from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.folder import RESULT
-from tests.integration.cell_files import services_file
+from tests.cli.test_new import on_free_port
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests" / "run" / "golden" / "catch_ball-undisturbed.journal"
-SIMULATED = "run catch_ball --mode lockstep --runs 1 --quiet"
+SIMULATED = "run carrier/carrier.toml --mode lockstep --runs 1 --quiet"
 COMMANDS = {
     "keys": "cell.key",
     "keys --tls": "keys",
     "new task mine": "mine.toml",
     "show catch_ball --out net.svg": "net.svg",
     "convert catch_ball net.pnml": "net.pnml",
-    "check catch_ball --json found.json": "found.json",
+    "check carrier/carrier.toml --json found.json": "found.json",
     "log run.journal --out log.jsonl": "log.jsonl",
     "report run.journal --out page.html": "page.html",
     "resume ended --json out.json": "out.json",
-    "up": "runs",
-    "serve --up": "runs",
-    "campaign catch_ball --runs 2 --workers 1 --quiet": "campaigns/catch_ball",
+    "up --services carrier/services.toml": "runs",
+    "serve --up --services carrier/services.toml": "runs",
+    "campaign carrier/carrier.toml --runs 2 --workers 1 --quiet": "campaigns/carrier",
     f"{SIMULATED} --journal runs": "run.journal",
     f"{SIMULATED} --learn learned.db": "learned.db",
     f"{SIMULATED} --report page": "page/result.json",
@@ -74,6 +75,13 @@ def _outcomes(steps: list[str], commands: list[str]) -> list[dict[str, Any]]:
     return found
 
 
+def _carrier(folder: Path) -> Path:
+    """Return the folder of a new robot, on a port that no other test uses."""
+    assert main(["new", "robot", "carrier", "--folder", str(folder)]) == 0
+    on_free_port(folder / "carrier")
+    return folder / "carrier"
+
+
 @pytest.mark.parametrize("disk", DISKS)
 def test_a_disk_that_cannot_be_written_is_reported_in_one_line(
     disk: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
@@ -88,10 +96,10 @@ def test_a_disk_that_cannot_be_written_is_reported_in_one_line(
         f"cp {GOLDEN} run.journal",
         "cp run.journal ended/",
         f"echo {result} > ended/{RESULT}",
+        f"cp -r {_carrier(tmp_path_factory.mktemp('robot'))} .",
         DISKS[disk].format(disk=tmp_path) + " || true",
     ]
-    free = f" --services {services_file(tmp_path_factory.mktemp('cell'))}"  # nobody else's ports
-    found = _outcomes(steps, [c + free if c.endswith("up") else c for c in COMMANDS])
+    found = _outcomes(steps, list(COMMANDS))
     for (command, name), outcome in zip(COMMANDS.items(), found, strict=True):
         said, where = outcome["said"].splitlines(), f"{disk}: petrobot {command}: {outcome}"
         told = [line for line in said if line.startswith(f"petrobot {command.split()[0]}: ")]
@@ -109,7 +117,7 @@ def test_a_disk_that_cannot_be_written_is_reported_in_one_line(
 
 @pytest.mark.parametrize("room", [12, 24, 64])
 def test_estimates_without_room_after_a_run_name_the_resume_that_gives_its_result(
-    room: int, tmp_path: Path
+    room: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """The journal has room, the estimates file has not: SQLite then fails in several ways."""
     if not _mounts():
@@ -117,7 +125,7 @@ def test_estimates_without_room_after_a_run_name_the_resume_that_gives_its_resul
     steps = [
         f"mount -t tmpfs -o size=400k none {tmp_path}",
         f"cd {tmp_path}",
-        f"{sys.executable} -B -m petrobot.coordinator new robot carrier",
+        f"cp -r {_carrier(tmp_path_factory.mktemp('robot'))} .",
         "cd carrier",
         f"(cat /dev/zero > fill 2>/dev/null || true); truncate -s -{room}K fill",
     ]

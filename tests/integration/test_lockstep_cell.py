@@ -35,7 +35,7 @@ port = 7305
 
 
 def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> dict[str, Any]:
-    """Run two throws; return the result without its wall-clock time."""
+    """Run one throw; return the result without its wall-clock time."""
     path = services.parent / "out.json"
     given = [
         "--services",
@@ -43,7 +43,7 @@ def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> di
         "--mode",
         "lockstep",
         "--runs",
-        "2",
+        "1",
         "--seed",
         str(seed),
         "--regime",
@@ -78,8 +78,16 @@ def usual(shared: Callable[..., Path]) -> dict[str, Any]:
     folder = shared("lockstep-cell", make)
     result: dict[str, Any] = json.loads((folder / "usual.json").read_text("utf-8"))
     assert result["status"] == "success"
-    assert result["caught"] == 2
+    assert result["caught"] == 1
     return result
+
+
+def test_the_result_has_the_keys_that_scripts_rely_on(usual: dict[str, Any]) -> None:
+    """And `wall_s`, which `run` has taken out."""
+    keys = {"task", "mode", "seed", "regime", "runs", "caught", "throws", "sim_s", "firings"}
+    assert keys <= set(usual) and usual["runs"] == 1
+    (throw,) = usual["throws"]
+    assert {"n", "speed", "caught", "miss_mm", "status"} <= set(throw)
 
 
 @pytest.mark.processes
@@ -106,7 +114,7 @@ def test_moving_the_camera_and_its_actions_changes_nothing(
 
 def test_another_seed_gives_other_throws(usual: dict[str, Any], tmp_path: Path) -> None:
     """Only the seed decides the throws."""
-    other = run(services_file(tmp_path), "--runs", "1", seed=6)
+    other = run(services_file(tmp_path), seed=6)
     assert other["throws"][0]["speed"] != usual["throws"][0]["speed"]
 
 

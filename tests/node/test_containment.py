@@ -305,7 +305,7 @@ async def test_a_run_that_reports_without_end_disturbs_no_other(
     operator: Operator, what: str, ends: set[str]
 ) -> None:
     """Events that are stored as fast as they come let it run to its deadline."""
-    chatting = asyncio.create_task(operator.call("chatter", 4.0, what=what))
+    chatting = asyncio.create_task(operator.call("chatter", 2.0, what=what))
     others = []
     limit = Limit("the run to end at its deadline")
     while not chatting.done() and limit.left():

@@ -159,6 +159,10 @@ class Ear:
         """Return whether all drives are in this state."""
         return [self.states.get(n) for n in DRIVES] == [state] * len(DRIVES)
 
+    def stopped_by_nmt(self) -> bool:
+        """Return whether each drive says that NMT has stopped it."""
+        return [self.nmt.get(n) for n in DRIVES] == [canopen.NmtState.STOPPED] * len(DRIVES)
+
     def close(self) -> None:
         """Leave the bus."""
         self._over.set()

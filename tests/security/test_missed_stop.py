@@ -108,6 +108,14 @@ class Turns:
         enough = self.begun() + 2
         await until(lambda: self.begun() >= enough, "hands that move")
 
+    async def moved(self, coordinator: subprocess.Popen[str]) -> None:
+        """Wait until a coordinator moves the hands, and kill it."""
+        try:
+            await self.moving()
+        finally:
+            coordinator.kill()
+            coordinator.communicate()
+
     async def estop(self, *options: str) -> None:
         """Give `petrobot estop`, whose devices all obey."""
         assert await asyncio.to_thread(main, self.estop_command(*options)) == 0
@@ -224,12 +232,7 @@ async def test_a_run_whose_devices_another_one_has_used_moves_nothing_more(turns
     finally:
         coordinator.kill()
         coordinator.communicate()
-    coordinator = turns.resume(run)
-    try:
-        await turns.moving()
-    finally:
-        coordinator.kill()
-        coordinator.communicate()
+    await turns.moved(turns.resume(run))
 
 
 @pytest.mark.parametrize("command", ["run", "resume"])
@@ -237,17 +240,23 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     turns: Turns, command: str
 ) -> None:
     """The coordinator is frozen before it has reached any node, even before it is Python. The
-    operator must order it again, and then it moves."""
+    operator must order it again, and then it moves. So does a run from before the stop whose
+    coordinator was killed: to resume it is a decision of the operator."""
     run = Path()
     if command == "resume":
         coordinator = turns.start(1.5)
         run = await turns.connected(coordinator)
         coordinator.kill()
         coordinator.communicate()
+        await turns.estop()
+        await turns.estop("--clear")
+        assert turns.begun() == 0
+        await turns.moved(turns.resume(run))
 
     def order() -> subprocess.Popen[str]:
         return turns.resume(run) if command == "resume" else turns.start(0.02)
 
+    then = turns.begun()
     for moment in (0.0, 0.1, 0.3) if command == "run" else (0.1,):
         coordinator = order()
         try:
@@ -258,17 +267,12 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
             await turns.estop("--clear")
             coordinator.send_signal(signal.SIGCONT)
             code, out, err = await finished(coordinator)
-            assert (code, turns.begun()) == (1, 0), out + err
+            assert (code, turns.begun()) == (1, then), out + err
             assert "order it again" in err
         finally:
             coordinator.kill()
             coordinator.communicate()
-    coordinator = order()
-    try:
-        await turns.moving()
-    finally:
-        coordinator.kill()
-        coordinator.communicate()
+    await turns.moved(order())
 
 
 async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns: Turns) -> None:
@@ -276,14 +280,14 @@ async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns
     the node."""
     coordinator = turns.start(0.02)
     run = await turns.connected(coordinator)
-    await turns.moving()
-    coordinator.kill()
-    coordinator.communicate()
+    await turns.moved(coordinator)
     await turns.estop()
     then = turns.begun()
-    for variables in ({}, {"PETROBOT_STATE": str(turns.folder / "another host")}):
+    another = {"PETROBOT_STATE": str(turns.folder / "another host")}
+    for variables, says in (({}, "still holds the devices"), (another, "left_hand: emergency")):
         code, out, err = await finished(turns.resume(run, **variables))
-        assert (code, turns.begun()) == (2, then) and "petrobot estop --clear" in err, out + err
+        assert (code, turns.begun()) == (2, then) and says in err, out + err
+        assert "petrobot estop --clear" in err, err
     await turns.estop("--clear")
     other = turns.start(0.5)
     try:
@@ -377,20 +381,3 @@ async def test_a_stop_during_the_preparation_ends_the_run(tmp_path: Path) -> Non
         finally:
             coordinator.kill()
             coordinator.communicate()
-
-
-async def test_a_run_that_is_resumed_after_the_stop_moves(turns: Turns) -> None:
-    """Its coordinator was killed between two runs. To resume it is a decision of the operator."""
-    coordinator = turns.start(1.5)
-    try:
-        run = await turns.connected(coordinator)
-        coordinator.kill()
-        coordinator.communicate()
-        await turns.estop()
-        await turns.estop("--clear")
-        assert turns.begun() == 0
-        coordinator = turns.resume(run)
-        await turns.moving()
-    finally:
-        coordinator.kill()
-        coordinator.communicate()

@@ -27,6 +27,8 @@ import numpy as np
 
 from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
 
+from .drivers import never_return
+
 
 def add(ctx: Context, *, a: int, b: int = 1) -> Result:
     """Return the sum."""
@@ -205,16 +207,14 @@ async def slow_service(ctx: Context, *, seconds: float) -> Result:
 
 def hang(ctx: Context) -> Result:
     """Never return, in a C call that Python cannot interrupt."""
-    while True:
-        pass
+    never_return()
 
 
 async def hang_moving(ctx: Context) -> Result:
     """Send the slide far away, then hang."""
     ctx.device.send({"to": 90.0})
     await ctx.sleep(0.1)
-    while True:
-        pass
+    never_return()
 
 
 def segfault(ctx: Context) -> Result:
