@@ -62,13 +62,11 @@ class OpcUaSession(Driver):
             raise ImportError('OPC UA needs asyncua: pip install "petrobot[opcua]"') from fault
         # Its warnings repeat, at each attempt, what `faults` says once.
         logging.getLogger("asyncua").setLevel(logging.ERROR)
-        self._password = ""
         self._keys: dict[str, tuple[Any, bytes, str]] = {}
         """By key: what the file holds, its content, "der" or "pem"."""
-        if self.user and not (password := ports.file(self.password_file).decode().strip("\r\n")):
+        self._password = ports.file(self.password_file).decode().strip("\r\n") if self.user else ""
+        if self.user and not self._password:
             raise ValueError(f"password_file: {self.password_file} is empty")
-        if self.user:
-            self._password = password
         if self.certificate:
             self._read_keys()
         self.values: dict[str, Any] = {}
@@ -131,10 +129,10 @@ class OpcUaSession(Driver):
         except x509.ExtensionNotFound:
             uris = []
         self.application_uri = self.application_uri or next(iter(uris), "")
-        if self.application_uri not in uris:
+        if uris and self.application_uri not in uris:
             raise ValueError(
-                f"application_uri: expected that of {self.certificate} ({', '.join(uris) or 'none'}"
-                f"), found {self.application_uri!r}: servers compare them"
+                f"application_uri: expected that of {self.certificate} ({', '.join(uris)}), found "
+                f"{self.application_uri!r}: servers compare them"
             )
 
     # --- driver ---------------------------------------------------------------------------------

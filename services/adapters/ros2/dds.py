@@ -67,7 +67,7 @@ class Types:
             return idl.sequence[one]
         return idl.sequence[one, field.size] if field.bounded else idl.array[one, field.size]
 
-    def make(self, interface: str, message: Message | str) -> IdlStruct:
+    def make(self, interface: str, message: Any) -> IdlStruct:
         """Return a message as DDS sends it; fields that are not given are 0, "" or empty. What
         rosbridge understands besides is understood here, too: a time "now", and base64."""
         if message == "now":
