@@ -261,11 +261,11 @@ class OpcUaSession(Driver):
             login = f"user {self.user!r} with the password in {self.password_file}"
             no_login = "anybody without a name: write user and password_file"
             return f"user: the server does not accept {login if self.user else no_login}"
-        if code == "BadCertificateTimeInvalid":
+        if self._keys and code == "BadCertificateTimeInvalid":
             own = self._keys["certificate"][0]
             span = f"{own.not_valid_before_utc:%Y-%m-%d} to {own.not_valid_after_utc:%Y-%m-%d}"
             return f"certificate: {self.certificate} is valid from {span}: renew it ({fault})"
-        if code.startswith("BadCertificate"):
+        if self._keys and code.startswith("BadCertificate"):
             return f"certificate: the server does not accept {self.certificate}: {fault}"
         try:
             offers = await Client(

@@ -156,7 +156,7 @@ class CaptureImages:
         else:
             text += "is it plugged in, is the pipeline right?"
         name = "GStreamer" if _is_pipeline(self._target) else "FFmpeg"
-        return text if _has(name) else f"{text} This OpenCV was built without {name}."
+        return text if _has(name) else f"{text} This OpenCV was built without {name}"
 
     def _take(self, capture: Any, ended: threading.Event) -> int:
         """Take images until the camera is lost or closed; return how many came."""
@@ -336,11 +336,11 @@ def _obstacle(target: int | str) -> str:
     """Return why a camera of this host may not open."""
     path = Path(f"/dev/video{target}" if isinstance(target, int) else target)
     if not path.exists():
-        return f"is it plugged in, is the address right? There is no {path}."
+        return f"is it plugged in, is the address right? There is no {path}"
     if path.is_file():
-        return f'it is a file; of a recording write "file:{path}".'
+        return f'it is a file; of a recording write "file:{path}"'
     if not os.access(path, os.R_OK | os.W_OK):
-        return f"this user may not open {path}; put it into the group video."
+        return f"this user may not open {path}; put it into the group video"
     return "does another program or device use it?"
 
 
