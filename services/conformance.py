@@ -50,6 +50,8 @@ WAIT = 0.03
 BUSY = 0.3
 """Share of its running time that the check may wait for a processor: beyond that also locks of the
 system are slow, and a wait tells nothing of the driver."""
+ALWAYS = 5, 0.8
+"""A method that waits so often, and in this share of its calls, does so on any computer."""
 LEAVING = 2.0
 """Seconds in which the threads and processes of a closed driver must end."""
 HELD = 3
@@ -243,6 +245,8 @@ class _Check:
         self.longest = 0.0
         self.waits: dict[str, list[float]] = {}
         """By method: how long it waited each time that this was too long (s)."""
+        self.calls: Counter[str] = Counter()
+        """By method: how often it was called."""
         try:
             self.schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
         except FileNotFoundError:  # a kernel without these statistics
@@ -315,6 +319,8 @@ class _Check:
         itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer, or for a thread
         that runs and holds the interpreter's lock. `sleep` takes too long if a thread holds the
         lock and does not run."""
+        name = getattr(method, "__name__", "a method")
+        self.calls[name] += 1
         before, asked = getrusage(RUSAGE_THREAD).ru_nvcsw, method == self.sleep
         begin, used = time.perf_counter(), time.process_time() + self.scheduled()[1]
         try:
@@ -327,7 +333,7 @@ class _Check:
                 if idle > max(WAIT, self.period) and (
                     threading.active_count() > 1 if asked else slept
                 ):
-                    self.waits.setdefault(method.__name__, []).append(idle)
+                    self.waits.setdefault(name, []).append(idle)
 
     def scheduled(self) -> tuple[float, float]:
         """Return how long this thread has run, and how long it has waited for a processor (s; 0
@@ -944,7 +950,8 @@ class _Check:
                 why = "its library does not release the lock (GIL); put it into another process"
             if name == "sleep" and len(waits) < HELD:
                 continue
-            if queued > BUSY * ran:
+            always = len(waits) >= max(ALWAYS[0], ALWAYS[1] * self.calls[name])
+            if queued > BUSY * ran and not always:
                 self.found.busy.append(f"{text}, perhaps because this computer is busy")
             else:
                 self.fault(f"{text}: {why}")

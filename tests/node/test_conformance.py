@@ -925,3 +925,17 @@ def test_a_sensor_is_watched_until_its_state_has_grown() -> None:
 
     (fault,) = check_driver(Sensor, simulated=True).faults
     assert fault.startswith("state: past grows all the time")
+
+
+def test_a_stop_that_always_waits_is_told_on_a_busy_computer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Waits(Axis):
+        def stop(self, now: float) -> None:
+            time.sleep(0.1)
+            super().stop(now)
+
+    monkeypatch.setattr(conformance, "BUSY", -1.0)
+    found = check_driver(Waits, [{"to": 0.1}, {"to": 0.0}], simulated=True)
+    (fault,) = found.faults
+    assert fault.startswith("stop: ") and "calls waited" in fault
