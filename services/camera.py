@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from petrobot.services.action import Context
+from petrobot.services.comm.streams.capture import without_login
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import Driver, Ports, key
 
@@ -125,22 +126,23 @@ class CameraDriver(Driver):
     def _unusable(self, image: Any) -> str:
         """Return what was expected of an image, and found; empty for one that can be used. A class
         of the user's may return anything."""
+        source = without_login(self.source)
         missing = [name for name in ("pixels", "time", "sequence") if not hasattr(image, name)]
         if missing:
             found = f"{type(image).__name__} without {missing[0]}"
-            return f"a petrobot.Image, found {found}: correct it in {self.source}"
+            return f"a petrobot.Image, found {found}: correct it in {source}"
         kind = str(getattr(image.pixels, "dtype", type(image.pixels).__name__))
         if kind != "uint8":
-            return f"pixels of type uint8, found {kind}: convert them in {self.source}"
+            return f"pixels of type uint8, found {kind}: convert them in {source}"
         shape = image.pixels.shape
         if self.shape and shape != self.shape:
             remedy = f"change {self.shaped_by or 'the driver'}, or the camera's settings"
             return f"images of {_size(self.shape)}, found {_size(shape)}; {remedy}"
         if len(shape) < 2 or shape[2:] != ((3,) if self._colour else ()) or 0 in shape:
             wanted = "width, 3)" if self._colour else "width), as without colour = true"
-            return f"pixels of shape (height, {wanted}, found {shape}: correct it in {self.source}"
+            return f"pixels of shape (height, {wanted}, found {shape}: correct it in {source}"
         if not isinstance(image.time, int | float) or not math.isfinite(image.time):
-            return f"a time in seconds, found {image.time!r:.40}: correct it in {self.source}"
+            return f"a time in seconds, found {image.time!r:.40}: correct it in {source}"
         return ""
 
     # For the node and the operator

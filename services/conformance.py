@@ -50,6 +50,8 @@ WAIT = 0.03
 BUSY = 0.3
 """Share of its running time that the check may wait for a processor: beyond that also locks of the
 system are slow, and a wait tells nothing of the driver."""
+ALWAYS = 5, 0.8
+"""A method that waits so often, and in this share of its calls, does so on any computer."""
 LEAVING = 2.0
 """Seconds in which the threads and processes of a closed driver must end."""
 HELD = 3
@@ -62,6 +64,8 @@ LARGEST_STATE = 100_000
 """Most items and characters of a state: it is sent after each step."""
 UNIT = 0.2
 """Greatest ratio of two units: above it, a position short of its goal was clamped."""
+TURNS, WRAP = (360.0, 2.0 * math.pi), 0.05
+"""A full turn (degrees, rad); an angle that changes by nearly one in a step has wrapped round."""
 JUMP = 3.0
 """Multiple of its fastest step by which a position may change at once."""
 MEASURED = (
@@ -233,7 +237,7 @@ class _Check:
         progress: Callable[[str], None],
     ) -> None:
         self.make, self.within, self.first, self.positions = make, within, first, positions
-        self.progress = progress
+        self.progress, self.simulated = progress, isinstance(clock, _Clock)
         self.now: Callable[[], float] = clock.monotonic
         self.sleep: Callable[[float], None] = clock.sleep
         self.found = DriverCheck()
@@ -241,6 +245,8 @@ class _Check:
         self.longest = 0.0
         self.waits: dict[str, list[float]] = {}
         """By method: how long it waited each time that this was too long (s)."""
+        self.calls: Counter[str] = Counter()
+        """By method: how often it was called."""
         try:
             self.schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
         except FileNotFoundError:  # a kernel without these statistics
@@ -313,6 +319,8 @@ class _Check:
         itself (`ru_nvcsw`), and does not only wait for one, as on a busy computer, or for a thread
         that runs and holds the interpreter's lock. `sleep` takes too long if a thread holds the
         lock and does not run."""
+        name = getattr(method, "__name__", "a method")
+        self.calls[name] += 1
         before, asked = getrusage(RUSAGE_THREAD).ru_nvcsw, method == self.sleep
         begin, used = time.perf_counter(), time.process_time() + self.scheduled()[1]
         try:
@@ -325,7 +333,7 @@ class _Check:
                 if idle > max(WAIT, self.period) and (
                     threading.active_count() > 1 if asked else slept
                 ):
-                    self.waits.setdefault(method.__name__, []).append(idle)
+                    self.waits.setdefault(name, []).append(idle)
 
     def scheduled(self) -> tuple[float, float]:
         """Return how long this thread has run, and how long it has waited for a processor (s; 0
@@ -383,10 +391,19 @@ class _Check:
                 self.limits(commands[0], commands[1], seconds)
             elif type(self.driver).command is not Driver.command:  # a sensor refuses them all
                 self.note("stop and hold during a movement: give two commands, there and back")
+            if len(commands) < 2:
+                self.grow(seconds)
         if cable is None:
             self.note("a pulled cable: give `cable`")
         else:
             self.cable(cable, commands, seconds)
+
+    def grow(self, seconds: float) -> None:
+        """Step so long that `close` sees whether the state of a sensor grows all the time."""
+        lasts = 2.2 * GROWING * self.period
+        if self.simulated or lasts <= 2.0 * seconds:
+            self.progress("the state of a sensor")
+            self.run(lasts)
 
     def life(self) -> None:
         """Make the driver, close it, make it again; stop it twice at rest."""
@@ -402,7 +419,7 @@ class _Check:
         for _ in range(REST):
             after = self.step()
             for name, value in after.items():
-                changes.setdefault(name, []).append(abs(value - before.get(name, value)))
+                changes.setdefault(name, []).append(abs(_change(before.get(name, value), value)))
             before = after
         for name, far in changes.items():
             # without the largest: a first answer of the device is a jump
@@ -437,7 +454,8 @@ class _Check:
             self.unmoved(there, before)
             return
         self.measured = self.measured if self.measured[1] else (positions, took)
-        far = {n: begin[n] - v for n, v in self.numbers().items() if n in positions.keys() & begin}
+        start, ended = self.start, self.numbers()
+        far = {n: _change(v, start[n]) for n, v in ended.items() if n in positions.keys() & start}
         fastest = self.fastest
         self.arrived(there, back, positions, seconds)
 
@@ -448,7 +466,13 @@ class _Check:
         if not self.move(back, PART * took, judged=False):
             self.note(f"stop and hold during {dict(back)}: it moves nothing after {dict(there)}")
             return
+        left = _differ(begin, self.numbers(), positions, PART)
         self.stop("stop during a movement", positions)
+        if left and left.isdisjoint(_differ(begin, self.numbers(), positions, SLOWEST)):
+            self.note(
+                f"stop during {dict(back)}: it went on to its end in less than {self.within:g} s, "
+                "as without a stop; give longer commands"
+            )
         begun()
         held = self.holds(back, positions, begin)
         before = self.numbers()
@@ -524,7 +548,8 @@ class _Check:
                 fro = asked[1].get(path, math.nan)
                 if _tells(to) and _tells(fro) and to != fro:
                     moved = max(abs(way - to), abs(way + fro)) <= PLAY * abs(way)
-                    off = [abs(last - to) / abs(way), abs(first - fro) / abs(way)]
+                    off = [abs(_change(to, last)), abs(_change(fro, first))]
+                    off = [miss / abs(way) for miss in off]
                     misses[name, path] = [0.0] if moved else off
         known = {part for pair, off in misses.items() if max(off) <= PLAY for part in pair}
         for (name, path), off in misses.items():
@@ -616,7 +641,8 @@ class _Check:
             self.stop("stop")
             return
         self.follow(there, 2.0 * seconds, self.numbers(), judged=False)
-        ways = {n: v - begin[n] for n, v in self.numbers().items() if n in begin and n in far}
+        ended = self.numbers()
+        ways = {n: _change(begin[n], v) for n, v in ended.items() if n in begin and n in far}
         most = max(map(abs, far.values()), default=0.0)
         deaf = {
             n
@@ -702,7 +728,8 @@ class _Check:
             for needed in (*self.first, command):
                 self.run(seconds, partial(self.accepts, needed))
             self.ready = max(self.ready, self.now() - begin)
-        else:
+        else:  # one that settles slowly may refuse it until then
+            self.run(self.within, self.stopped)
             self.accepts(command)
         if self.refusing:
             self.fault(f"{dict(command)}: refused: {self.refusing}")
@@ -714,14 +741,19 @@ class _Check:
     ) -> Mapping[str, float]:
         """Step for `seconds`, or until the device stands still again; return how far each position
         has moved since `begin`."""
-        before = low = high = begin
+        before = low = high = shown = begin
         fastest, resting = dict[str, float](), 0
         moved, untrue = set[str](), Counter[str]()
         ways, away = dict[str, float](), set[str]()
         end = self.now() + seconds
         while self.now() < end and resting < REST:
             still = self.stopped()
-            after = self.step()
+            newest = self.step()
+            after = {  # an angle that wraps round moves on
+                name: before[name] + _change(shown[name], value) if name in before else value
+                for name, value in newest.items()
+            }
+            shown = newest
             low = {name: min(value, low.get(name, value)) for name, value in after.items()}
             high = {name: max(value, high.get(name, value)) for name, value in after.items()}
             ways = {n: abs(v - begin[n]) for n, v in after.items() if n in begin and n in before}
@@ -791,7 +823,7 @@ class _Check:
         drifted = {n for point in points for n in _differ(points[0], point, positions, PLAY)}
         for name in positions:
             places = [point[name] for point in points[:: len(points) // 4] if name in point]
-            ways = sorted((after - before for before, after in pairwise(places)), key=abs)
+            ways = sorted((_change(before, after) for before, after in pairwise(places)), key=abs)
             least = max(CREEP * positions[name], self.idle.get(name, 0.0))
             if len(ways) > 3 and all(way / ways[-1] > 0.5 for way in ways if abs(way) > least):
                 drifted |= {name} if abs(ways[0]) > least else set()
@@ -826,7 +858,7 @@ class _Check:
         while self.now() < end:
             after = self.step()
             for name in positions.keys() & before.keys() & after.keys():
-                steps.setdefault(name, []).append(abs(after[name] - before[name]))
+                steps.setdefault(name, []).append(abs(_change(before[name], after[name])))
             before = after
         # without the two largest: values may vanish and come back
         ways = {name: sum(sorted(far)[:-2]) for name, far in steps.items()}
@@ -918,7 +950,8 @@ class _Check:
                 why = "its library does not release the lock (GIL); put it into another process"
             if name == "sleep" and len(waits) < HELD:
                 continue
-            if queued > BUSY * ran:
+            always = len(waits) >= max(ALWAYS[0], ALWAYS[1] * self.calls[name])
+            if queued > BUSY * ran and not always:
                 self.found.busy.append(f"{text}, perhaps because this computer is busy")
             else:
                 self.fault(f"{text}: {why}")
@@ -982,7 +1015,17 @@ def _differ(
 ) -> set[str]:
     """Return the positions that differ by more than a share of their movement."""
     known = (name for name in ways if name in before and name in after)
-    return {name for name in known if abs(after[name] - before[name]) > share * ways[name]}
+    return {name for name in known if abs(_change(before[name], after[name])) > share * ways[name]}
+
+
+def _change(before: float, after: float) -> float:
+    """Return by how much a number has changed. An angle may wrap round: 359 degrees are next to
+    0."""
+    change = after - before
+    for turn in TURNS:
+        if abs(abs(change) - turn) < WRAP * turn and max(abs(before), abs(after)) <= turn:
+            return change - math.copysign(turn, change)
+    return change
 
 
 def _names(found: set[str]) -> str:

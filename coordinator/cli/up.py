@@ -7,6 +7,7 @@ import argparse
 import asyncio
 import getpass
 import os
+import re
 import signal
 import sys
 from collections.abc import Awaitable
@@ -89,16 +90,20 @@ UNIT = """\
 Description=petrobot nodes of {services}
 Wants=network-online.target
 After=network-online.target
+# A device that is plugged in late is waited for, however often the nodes fail until then.
+StartLimitIntervalSec=0
 
 [Service]
 User={user}
 WorkingDirectory={folder}
-ExecStart="{petrobot}" up --services "{services}" --logs "{logs}"{dry_run}
+ExecStart={command}
 Restart=on-failure
 RestartSec=1
 # petrobot stops its nodes itself, devices first; what is left is killed.
 KillMode=mixed
 TimeoutStopSec=10
+# A worker that the kernel kills for want of memory is started again by its node.
+OOMPolicy=continue
 # Real-time priority for threads that ask for it (docs/deploy.md):
 #LimitRTPRIO=50
 #LimitMEMLOCK=infinity
@@ -111,16 +116,19 @@ WantedBy=multi-user.target
 def unit(directory: Directory, logs: Path) -> str:
     """Return a systemd unit that starts this host's nodes, with absolute paths."""
     services = directory.source.resolve()
-    paths = {
-        "services": services,
-        "folder": services.parent,
-        "logs": logs.absolute(),
-        "petrobot": Path(sys.executable).with_name("petrobot"),
-    }
-    # In a unit, "%" begins a specifier.
-    texts = {name: str(path).replace("%", "%%") for name, path in paths.items()}
-    texts["dry_run"] = " --dry-run" if directory.dry_run else ""
-    return UNIT.format(user=getpass.getuser(), **texts)
+    program = Path(sys.executable).with_name("petrobot")
+    # In a command "$" begins a variable; in all of a unit "%" begins a specifier.
+    program_, services_, logs_ = (
+        '"' + re.sub(r'(["\\])', r"\\\1", str(path)).replace("$", "$$") + '"'
+        for path in (program, services, logs.absolute())
+    )
+    command = f"{program_} up --services {services_} --logs {logs_}"
+    return UNIT.format(
+        services=str(services).replace("%", "%%"),
+        folder=str(services.parent).replace("%", "%%"),
+        command=(command + " --dry-run" * directory.dry_run).replace("%", "%%"),
+        user=getpass.getuser(),
+    )
 
 
 async def _up(directory: Directory, options: argparse.Namespace) -> int:

@@ -43,6 +43,8 @@ LATENCY_RATE, FLASHES, SEEN_AFTER = 1000.0, 40, 0.5
 seconds after which each of them has surely been seen."""
 LEAST_CHANGE = 30.0
 """Grey levels by which the flash must change the brightest place of an image."""
+POOR_PX, POOR_PLACE = 0.5, 0.005
+"""Residuals (px, m) above which the report says how to make better images."""
 EXIT_BAD_INPUT = 2
 
 
@@ -123,6 +125,11 @@ def run(
 def report(found: Calibration, views: int) -> str:
     """Return what the calibration found, as text for the operator."""
     x, y, z = found.optics.position
+    poor = found.residual_px > POOR_PX or found.table_residual > POOR_PLACE
+    hint = (
+        f"better are {POOR_PX:g} px and {POOR_PLACE * 1e3:g} mm: take sharper images, of a flatter "
+        "board, and measure [board] square and the places again"
+    )
     return "\n".join(
         [
             f"board seen whole in {found.views} of {views} images",
@@ -131,6 +138,7 @@ def report(found: Calibration, views: int) -> str:
             f"a point of the table is known to {found.table_sigma * 1e3:.2f} mm (standard "
             "deviation)",
             f"focal length {found.optics.focal[0]:.1f} px, camera at ({x:.4f}, {y:.4f}, {z:.4f}) m",
+            *[hint] * poor,
         ]
     )
 

@@ -35,6 +35,14 @@ ROUNDS = 20
 """Most rounds of estimating the accuracies."""
 FEWEST_VIEWS, FEWEST_KNOWN = 6, 3
 """Fewest views with the whole board, and fewest of them with a known pose."""
+LEAST_TILT, FOCAL_SHARE, SCALE_SHARE = 10.0, 0.02, 0.01
+"""Least angle between two boards (degrees); greatest standard deviation of the focal length, as a
+share of it; and greatest share by which distances of boards may be other ones than stated."""
+ASTRAY = 0.05, 5.0
+"""How far (m, degrees) a board may be from where its pose says, by the first estimate: further, and
+the pose is wrong, not inaccurate."""
+MOST_STEPS = 500
+"""Steps of a fit; one that converges takes some ten."""
 LENS = 8
 """Number of lens unknowns: fx fy cx cy k1 k2 p1 p2."""
 
@@ -67,10 +75,11 @@ class Board:
 @dataclass(frozen=True, slots=True)
 class BoardView:
     """One image of the board, grey levels (height, width); `pose` (4, 4) from board frame to base
-    frame, None where unknown."""
+    frame, None where unknown; `name` that of its file."""
 
     pixels: NDArray[np.uint8]
     pose: Array | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +129,12 @@ def _begins_black(pixels: NDArray[np.uint8], corners: Array, board: Board) -> bo
 
 
 def calibrate(views: Sequence[BoardView], board: Board) -> Calibration:
-    """Calibrate from board images. Raises CalibrationError when they are too few."""
+    """Calibrate from board images. Raises CalibrationError when they are too few, or do not fit
+    together."""
+    sizes = {view.pixels.shape[::-1]: view.name for view in views}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{name} {wide}x{high}" for (wide, high), name in sizes.items())
+        raise CalibrationError(f"expected images of one size, of one camera, found {listed}")
     seen = [
         (corners, view)
         for view in views
@@ -135,19 +149,27 @@ def calibrate(views: Sequence[BoardView], board: Board) -> Calibration:
         )
     height, width = seen[0][1].pixels.shape
     return adjust(
-        [corners for corners, _ in seen], [view.pose for _, view in seen], board, (width, height)
+        [corners for corners, _ in seen],
+        [view.pose for _, view in seen],
+        board,
+        (width, height),
+        [view.name for _, view in seen],
     )
 
 
 def adjust(
-    corners: Sequence[Array], poses: Sequence[Array | None], board: Board, size: tuple[int, int]
+    corners: Sequence[Array],
+    poses: Sequence[Array | None],
+    board: Board,
+    size: tuple[int, int],
+    names: Sequence[str] = (),
 ) -> Calibration:
-    """Calibrate from the corners (n, 2) px of each view, its pose (4, 4) or None, and the image's
-    width and height.
+    """Calibrate from the corners (n, 2) px of each view, its pose (4, 4) or None, the image's
+    width and height, and names of the views for messages.
 
     Raises CalibrationError when the views do not determine the camera.
     """
-    return _Adjustment(board, corners, poses, size).solve()
+    return _Adjustment(board, corners, poses, size, names).solve()
 
 
 class _Adjustment:
@@ -169,11 +191,14 @@ class _Adjustment:
         corners: Sequence[Array],
         poses: Sequence[Array | None],
         size: tuple[int, int],
+        names: Sequence[str],
     ) -> None:
         self._points = board.points()
         self._corners = corners
         self._poses = poses
         self._size = size
+        self._board = board
+        self._names = names or [f"view {number}" for number in range(1, len(corners) + 1)]
         self._accuracy = np.array(RULER)
         """Of a corner (px), a stated direction (rad) and a stated place (m)."""
         known = sum(pose is not None for pose in poses)
@@ -204,7 +229,13 @@ class _Adjustment:
         from scipy.optimize import least_squares
 
         fit = least_squares(
-            self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10
+            self._residuals,
+            start,
+            self._slopes,
+            method="lm",
+            x_scale="jac",
+            xtol=1e-10,
+            max_nfev=MOST_STEPS,
         )
         if not fit.success:
             raise CalibrationError(
@@ -234,7 +265,7 @@ class _Adjustment:
     def _start(self) -> Array:
         points = [self._points.astype(np.float32)] * len(self._corners)
         corners = [c.astype(np.float32)[:, None, :] for c in self._corners]
-        _, matrix, distortion, turns, shifts = cv2.calibrateCamera(
+        _, matrix, distortion, turns, shifts, spread, *_ = cv2.calibrateCameraExtended(
             points,
             corners,
             self._size,
@@ -246,6 +277,7 @@ class _Adjustment:
             _pose(np.ravel(turn), np.ravel(shift))
             for turn, shift in zip(turns, shifts, strict=True)
         ]
+        self._check(float(spread[:2].max() / matrix[0, 0]), placed)
         first = next(i for i, pose in enumerate(self._poses) if pose is not None)
         base = placed[first] @ np.linalg.inv(np.asarray(self._poses[first]))
         parts = [
@@ -258,6 +290,50 @@ class _Adjustment:
             for known, p in zip(self._poses, placed, strict=True)
         ]
         return np.concatenate([np.asarray(part, float) for part in parts])
+
+    def _check(self, focal_share: float, placed: Sequence[Array]) -> None:
+        """Refuse what no fit can mend, by the first estimates: the standard deviation of the focal
+        length, as its share, and the boards' poses in the camera's frame."""
+        normals = np.array([pose[:3, 2] for pose in placed])
+        tilt = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
+        if tilt < LEAST_TILT or not focal_share <= FOCAL_SHARE:
+            raise CalibrationError(
+                f"the images do not determine the lens: the boards lie within {tilt:.0f} degrees "
+                "of parallel, or too few are tilted; hold the board at six places, tilted by 20 to "
+                "45 degrees to different sides"
+            )
+        known = [
+            (name, pose, stated)
+            for name, pose, stated in zip(self._names, placed, self._poses, strict=True)
+            if stated is not None
+        ]
+        seen, said = (
+            sum(float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in poses for b in poses)
+            for poses in ([view[1] for view in known], [view[2] for view in known])
+        )
+        if said and abs(seen / said - 1.0) > SCALE_SHARE:
+            raise CalibrationError(
+                f"the known boards are {seen / said:.4g} times as far apart as their poses say: is "
+                f"the side of a square {self._board.square * said / seen:.3g} m instead of "
+                f"{self._board.square:g} m, are all poses in m?"
+            )
+        # Each known view tells where the base is; those that disagree with most are wrong.
+        middle = np.append(np.mean([pose @ self._middle() for *_, pose in known], axis=0)[:3], 1.0)
+        bases = [pose @ np.linalg.inv(stated) for _, pose, stated in known]
+        apart = np.array([[_apart(a, b, middle) for a in bases] for b in bases]) / ASTRAY
+        agree = apart.max(axis=2) <= 1.0
+        best = agree[int(agree.sum(axis=1).argmax())]
+        if not best.all():
+            wrong = ", ".join(view[0] for view, fine in zip(known, best, strict=True) if not fine)
+            raise CalibrationError(
+                f"{wrong}: the board is not where the pose says, if the other views are right: "
+                "origin at the first inner corner, beside a black square, x along the columns, z "
+                "up; or columns and rows of [board] are exchanged"
+            )
+
+    def _middle(self) -> Array:
+        """Return the middle of the board in its frame (4,)."""
+        return np.append(self._points.mean(axis=0), 1.0)
 
     def _residuals(self, unknown: Array) -> Array:
         """Return the corner residuals in units of their accuracy, then the deviations of the known
@@ -354,6 +430,13 @@ def _pose(turn: Array, shift: Array) -> Array:
     pose[:3, :3] = cv2.Rodrigues(np.asarray(turn, float))[0]
     pose[:3, 3] = shift
     return pose
+
+
+def _apart(a: Array, b: Array, point: Array) -> tuple[float, float]:
+    """Return how far two poses (4, 4) put a point (4,) apart (m), and their angle (degrees)."""
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1.0) / 2.0
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return float(np.linalg.norm((a - b) @ point)), float(angle)
 
 
 def _vector(pose: Array) -> Array:
@@ -453,7 +536,7 @@ def read_views(folder: Path) -> tuple[list[BoardView], Board]:
     CalibrationFileError.
     """
     board, entries = _listed(folder)
-    return [BoardView(_grey(path), pose) for path, pose in entries], board
+    return [BoardView(_grey(path), pose, path.name) for path, pose in entries], board
 
 
 def missing_views(folder: Path) -> tuple[list[tuple[Path, bool]], Board]:
@@ -475,6 +558,8 @@ def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
             int(data["board"]["rows"]),
             float(data["board"]["square"]),
         )
+        if min(board.columns, board.rows) < 3 or not 0.0 < board.square < 10.0:
+            raise ValueError
         entries = [(folder / str(entry["file"]), _pose_of(entry, path)) for entry in data["views"]]
     except OSError as fault:
         raise CalibrationFileError(
@@ -486,6 +571,13 @@ def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
         raise CalibrationFileError(
             f"{path}: key {fault} is missing; docs/vision.md shows such a file"
         ) from fault
+    except (TypeError, ValueError) as fault:
+        if isinstance(fault, CalibrationFileError):
+            raise
+        raise CalibrationFileError(
+            f"{path}: [board]: expected columns and rows from 3, and square in m (the side of a "
+            f"square), found {data.get('board')}"
+        ) from fault
     return board, entries
 
 
@@ -493,8 +585,17 @@ def _pose_of(entry: Mapping[str, Any], path: Path) -> Array | None:
     if "pose" not in entry:
         return None
     try:
-        return np.array(entry["pose"], float).reshape(4, 4)
+        pose = np.array(entry["pose"], float).reshape(4, 4)
+        turn = pose[:3, :3]
+        if np.abs(turn @ turn.T - np.eye(3)).max() > 0.01 or np.linalg.det(turn) < 0.0:
+            raise CalibrationFileError(
+                f"{path}: pose of {entry['file']}: its first three columns are not a rotation: "
+                "expected three directions of length 1, at right angles, right-handed"
+            )
+        return pose
     except (TypeError, ValueError) as fault:
+        if isinstance(fault, CalibrationFileError):
+            raise
         raise CalibrationFileError(
             f"{path}: pose of {entry['file']}: expected 4 rows of 4 numbers"
         ) from fault

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,7 @@ SERVICES = 'schema = 1\n[nodes.left]\nhost = "127.0.0.1"\nport = 4901\n'
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
     """A location file in a folder whose name needs quotes."""
-    folder = tmp_path / "my robot 100%"
+    folder = tmp_path / 'my "robot" 100% $HOME a\\b'
     folder.mkdir()
     (folder / "services.toml").write_text(SERVICES, encoding="utf-8")
     return folder
@@ -32,8 +33,11 @@ def test_the_unit_has_absolute_paths(cell: Path, capsys: pytest.CaptureFixture[s
     folder = str(cell).replace("%", "%%")
     assert unit["Service"]["WorkingDirectory"] == folder
     program = Path(sys.executable).with_name("petrobot")
-    begin = f'"{program}" up --services "{folder}/services.toml" --logs "/'
-    assert unit["Service"]["ExecStart"].startswith(begin)
+    command = shlex.split(unit["Service"]["ExecStart"].replace("$$", "$"))
+    assert command[:5] == [str(program), "up", "--services", f"{folder}/services.toml", "--logs"]
+    assert command[5].startswith("/") and "$HOME" not in unit["Service"]["ExecStart"].replace(
+        "$$HOME", ""
+    )
 
 
 @pytest.mark.processes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -139,23 +140,29 @@ def test_images_of_a_camera_are_stamped_on_arrival(device: type[Device]) -> None
 
 
 def test_a_lost_camera_is_opened_again(
-    device: type[Device], caplog: pytest.LogCaptureFixture
+    device: type[Device], caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    """While it is away `condition` and `start` say so."""
-    images = CaptureImages(0, time.monotonic, CaptureSettings(colour=True))
+    """While it is away `condition` and `start` say so. It may come back as another device file."""
+    path = tmp_path / "eye"
+    path.symlink_to("/dev/null")
+    images = CaptureImages(str(path), time.monotonic, CaptureSettings(colour=True))
     images.start(30.0)
     first: Image = wait_for(images.newest, awaited="an image")
     assert first.pixels.shape == (*SIZE, 3)
+    path.unlink()
     device.absent = True
     wait_for(lambda: "cannot be opened" in images.condition, awaited="the loss")
-    with pytest.raises(ConnectionError, match="camera 0 cannot be opened: is it plugged in"):
+    with pytest.raises(ConnectionError, match=r"eye' cannot be opened: is it plugged in, .* no /"):
         images.start(30.0)
+    path.symlink_to("/dev/zero")
     device.absent = False
     wait_for(lambda: not images.condition, awaited="the return")
     later: Image = wait_for(images.newest, awaited="an image after the return")
     assert later.time > first.time
     images.close()
-    assert "camera 0 was lost; it is opened again in" in caplog.text
+    assert "eye' was lost; it is opened again in" in caplog.text
+    opened = [how for how in device.opened if how != "released"]
+    assert opened[0][0] == "/dev/null" and opened[-1][0] == "/dev/zero"
     assert device.opened.count("released") == len(device.opened) / 2
 
 
@@ -170,6 +177,91 @@ def test_an_image_that_cannot_be_converted_is_no_end(device: type[Device]) -> No
     device.channels = 3
     wait_for(images.newest, awaited="an image")
     images.close()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "table", "text"),
+    [
+        (np.zeros((4, 6), np.uint16), {}, "expected 8 bits .*, found uint16"),
+        (np.zeros((4, 6, 3), np.float32), {"colour": True}, "expected 8 bits .*, found float32"),
+        (np.zeros((4, 6), np.uint8), {"colour": True}, r"expected colours, .*remove colour = true"),
+        (np.zeros((4, 6, 4), np.uint8), {"colour": True}, r"expected colours, found \(4, 6, 4\)"),
+        (np.zeros((4, 6), np.uint8), {}, ""),
+        (np.zeros((4, 6, 1), np.uint8), {}, ""),
+        (np.zeros((4, 6, 4), np.uint8), {}, ""),
+    ],
+)
+def test_images_of_other_kinds(
+    device: type[Device], pixels: np.ndarray, table: dict[str, Any], text: str
+) -> None:
+    device.retrieve = lambda self: (True, pixels)  # type: ignore[method-assign]
+    images = open_images({"source": "capture:0", **table}, time.monotonic)
+    if text:
+        with pytest.raises(ConnectionError, match=text):
+            images.start(30.0)
+    else:
+        images.start(30.0)
+        assert wait_for(images.newest, awaited="an image").pixels.shape == (4, 6)
+    images.close()
+
+
+def test_another_size_than_it_was_asked_for(
+    device: type[Device], caplog: pytest.LogCaptureFixture
+) -> None:
+    """OpenCV reports that the camera has accepted the size."""
+    images = open_images({"source": "capture:0", "width": 1920}, time.monotonic)
+    images.start(30.0)
+    wait_for(images.newest, awaited="an image")
+    images.close()
+    high, wide = SIZE
+    text = f"camera 0 was asked for images of 1920x{high} and gives {wide}x{high}"
+    assert caplog.text.count(text) == 1
+
+
+def test_a_camera_that_blocks(device: type[Device]) -> None:
+    """V4L2 lets a read wait for 10 s. Meanwhile the reason is said; after a close and a start one
+    thread alone has the camera."""
+    inside, block, now = threading.Event(), threading.Event(), [0.0]
+    images = CaptureImages(0, lambda: now[0])
+    grab = device.grab
+
+    def blocking(self: Device) -> bool:
+        if now[0] and not inside.is_set():
+            inside.set()
+            block.wait(60.0)
+        return grab(self)
+
+    device.grab = blocking  # type: ignore[method-assign]
+    images.start(30.0)
+    wait_for(images.newest, awaited="an image")
+    now[0] = 4.0
+    assert inside.wait(60.0)
+    now[0] = 9.0
+    assert re.fullmatch("camera 0 has given no image for [59] s", images.condition)
+    images.close()
+    images.start(30.0)
+    wait_for(images.newest, awaited="an image of the second opening")
+    assert not images.condition
+    block.set()
+    wait_for(lambda: "released" in device.opened, awaited="the end of the first")
+    images.close()
+    assert device.opened.count("released") == 2 and len(device.opened) == 4
+
+
+def test_why_a_camera_of_this_host_cannot_be_opened(device: type[Device], tmp_path: Path) -> None:
+    device.absent = True
+    (tmp_path / "balls.avi").write_bytes(b"")
+    for target, text in {
+        "/dev/null": "does another program or device use it",
+        "/dev/nothing": "There is no /dev/nothing",
+        str(tmp_path / "balls.avi"): 'of a recording write "file:',
+        "rtspsrc location=x user-id=ana user-pw=secret ! appsink": "is the pipeline right",
+    }.items():
+        images = open_images({"source": f"capture:{target}"}, time.monotonic)
+        with pytest.raises(ConnectionError, match=text) as raised:
+            images.start(30.0)
+        images.close()
+        assert "secret" not in str(raised.value)
 
 
 def test_images_that_nobody_wants_are_taken_and_dropped(device: type[Device]) -> None:
@@ -422,6 +514,7 @@ def test_sources_by_config(config: dict[str, object], kind: type) -> None:
         ({"source": "nowhere.cams:Basler"}, "No module named 'nowhere'"),
         ({"source": "tests.comm.test_capture:Basler"}, "no attribute 'Basler'"),
         ({"source": "file:"}, 'use "sim"'),
+        ({"source": "rtsp://ana:secret@10.0.0.5/"}, r"source = 'rtsp://10\.0\.0\.5/'"),
     ],
 )
 def test_bad_sources_are_refused_with_a_remedy(config: dict[str, object], text: str) -> None:

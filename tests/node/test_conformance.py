@@ -804,3 +804,138 @@ def test_keys_of_the_table_may_be_given() -> None:
     made: list[tuple[float, float]] = []
     check_driver(Far, [{"to": 0.1}, {"to": 0.2}], {"reach": 2.0}, simulated=True)
     assert {reach for reach, _ in made} == {2.0} and {speed for _, speed in made} >= {1.0, 0.25}
+
+
+class Wraps(Driver):
+    """A turntable (degrees, or rad) whose angle wraps round, with a noisy encoder."""
+
+    period = 0.01
+    obeys = ("pause",)
+    turn, low = 360.0, 0.0
+
+    def setup(self) -> None:
+        self.angle, self.goal = 0.0, 0.0
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if set(body) != {"to"}:
+            raise ValueError("to: expected an angle")
+        self.goal = float(body["to"])
+
+    def step(self, now: float) -> None:
+        off = self.goal - self.angle
+        off -= self.turn * round(off / self.turn)
+        if not self.paused:
+            self.angle += max(-self.turn / 400, min(self.turn / 400, off))
+            self.angle -= self.turn * (self.angle >= self.turn + self.low)
+            self.angle += self.turn * (self.angle < self.low)
+
+    def state(self) -> Mapping[str, Any]:
+        noise = float(self.ports.random("encoder").normal(0.0, 1e-5 * self.turn))
+        return {"angle": (self.angle + noise - self.low) % self.turn + self.low}
+
+    def stop(self, now: float) -> None:
+        self.goal = self.angle
+
+    def stopped(self) -> bool:
+        off = abs(self.goal - self.angle)
+        return min(off, abs(off - self.turn)) < 1e-9
+
+
+class WrapsRadians(Wraps):
+    turn, low = 2.0 * math.pi, -math.pi
+
+
+class WrapsAndDoesNotHold(Wraps):
+    def hold(self, now: float) -> str:
+        return "held"
+
+
+class Belt(Axis):
+    """Moves by a distance: `to`."""
+
+    def stopped(self) -> bool:
+        return abs(self.at - self.goal) < 1e-9
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        self.goal = self.at + body["to"]
+
+
+class Slow(Axis):
+    """Approaches its goal ever more slowly, and refuses commands until it is there."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if not self.stopped() and body != conformance.UNKNOWN:
+            raise ValueError("it moves")
+        super().command(now, body)
+
+    def step(self, now: float) -> None:
+        if not self.paused:
+            far = self.goal - self.at
+            self.at += max(-0.002, min(0.002, 0.05 * far)) if abs(far) > 1e-5 else far
+
+
+class SlowAndDeaf(Slow):
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        if self.stopped() or body == conformance.UNKNOWN:
+            super().command(now, body)
+
+
+class GoesOn(Axis):
+    """Its stop does nothing, which a short movement hides."""
+
+    def stop(self, now: float) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("kind", "commands", "found"),
+    [
+        (Wraps, ({"to": 350.0}, {"to": 170.0}), ""),
+        (Wraps, ({"to": 0.0}, {"to": 120.0}), ""),
+        (WrapsRadians, ({"to": 3.0}, {"to": -3.0}), ""),
+        (WrapsAndDoesNotHold, ({"to": 350.0}, {"to": 170.0}), "hold: answered 'held', and angle"),
+        (Belt, ({"to": 0.4}, {"to": -0.4}), ""),
+        (Slow, ({"to": 0.4}, {"to": 0.0}), ""),
+        (SlowAndDeaf, ({"to": 0.4}, {"to": 0.0}), "accepted during {'to': 0.0}, and axis"),
+        (GoesOn, ({"to": 0.1}, {"to": 0.02}), "not checked: stop during {'to': 0.1}: it went on"),
+    ],
+)
+def test_devices_that_people_have(
+    kind: type[Driver], commands: tuple[Mapping[str, Any], ...], found: str
+) -> None:
+    """Angles that wrap round, distances instead of places, ends that are approached slowly."""
+    check = check_driver(kind, commands, simulated=True)
+    told = check.faults + [text for text in check.notes if "stop during" in text]
+    assert any(found in text for text in told) if found else told == [], check
+
+
+def test_a_sensor_is_watched_until_its_state_has_grown() -> None:
+    class Sensor(Driver):
+        period = 0.01
+
+        def setup(self) -> None:
+            self.past: list[float] = []
+
+        def step(self, now: float) -> None:
+            self.past.append(now)
+
+        def state(self) -> Mapping[str, Any]:
+            return {"past": list(self.past)}
+
+    (fault,) = check_driver(Sensor, simulated=True).faults
+    assert fault.startswith("state: past grows all the time")
+
+
+def test_a_stop_that_always_waits_is_told_on_a_busy_computer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Waits(Axis):
+        def stop(self, now: float) -> None:
+            time.sleep(0.1)
+            super().stop(now)
+
+    monkeypatch.setattr(conformance, "BUSY", -1.0)
+    found = check_driver(Waits, [{"to": 0.1}, {"to": 0.0}], simulated=True)
+    (fault,) = found.faults
+    assert fault.startswith("stop: ") and "calls waited" in fault

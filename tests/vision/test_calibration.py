@@ -3,7 +3,7 @@ alone; files and command."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -171,6 +171,55 @@ def test_the_images_tell_how_well_the_boards_were_measured(
     assert 0.4 < stated / float(np.sqrt(np.mean(np.square(errors)))) < 2.5
 
 
+def _turned(poses: list[Array | None]) -> list[Array | None]:
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    return [poses[0], None if poses[1] is None else poses[1] @ turn, *poses[2:]]
+
+
+@pytest.mark.parametrize(
+    ("views", "square", "wrong", "text"),
+    [
+        (range(9), 0.06, list, "within 0 degrees of parallel.*hold the board at six places"),
+        ([0] * 8, 0.06, list, "do not determine the lens"),
+        ([*range(5), 10], 0.06, list, "do not determine the lens: .*or too few are tilted"),
+        (range(17), 0.05, list, r"0\.83\d+ times .* square 0\.06 m instead of 0\.05 m"),
+        (range(17), 0.061, list, r"square 0\.06 m instead of 0\.061 m"),
+        (range(17), 6.0, list, r"square 0\.06 m instead of 6 m"),
+        (range(17), 0.06, _turned, "^view 2: the board is not where the pose says"),
+        (range(17), 0.06, lambda p: [p[1], p[0], *p[2:]], "^view 1, view 2: the board is not"),
+    ],
+)
+def test_poor_boards_are_refused_with_a_reason(
+    cell: dict[str, Any],
+    views: Sequence[int],
+    square: float,
+    wrong: Callable[[list[Array | None]], list[Array | None]],
+    text: str,
+) -> None:
+    """A fit to them would take minutes, or give a wrong lens with a small standard deviation."""
+    noise = np.random.default_rng(7)
+    corners, poses = synthetic_corners(nominal_optics(cell), noise, 0.05, 0.0003)
+    chosen = [corners[view] + noise.normal(0.0, 0.05, corners[view].shape) for view in views]
+    with pytest.raises(CalibrationError, match=text):
+        adjust(chosen, wrong([poses[view] for view in views]), Board(square=square), (640, 480))
+
+
+def test_images_of_two_sizes_are_refused() -> None:
+    small, large = (
+        BoardView(np.zeros(size, np.uint8), name=name)
+        for size, name in (((48, 64), "a.png"), ((96, 128), "b.png"))
+    )
+    with pytest.raises(CalibrationError, match=r"of one size.*a\.png 64x48, b\.png 128x96"):
+        calibrate([small, large], Board())
+
+
+def test_the_report_says_how_to_make_better_images() -> None:
+    good = parse_calibration(DEFAULT.read_text(encoding="utf-8"), "lab.toml")
+    assert "better are" not in command.report(good, 17)
+    assert "take sharper images" in command.report(replace(good, residual_px=1.1), 17)
+    assert "the places again" in command.report(replace(good, table_residual=0.008), 17)
+
+
 def test_too_few_views_are_refused(views: Views) -> None:
     with pytest.raises(CalibrationError, match="known pose; take at least 6"):
         calibrate(views[:3], Board())
@@ -231,6 +280,13 @@ def test_bad_file_is_refused_with_file_and_remedy(old: str, new: str, fault: str
             '[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\npose=[1]\n',
             "expected 4 rows of 4",
         ),
+        (
+            '[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n'
+            "pose=[[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]\n",
+            "pose of a.png: its first three columns are not a rotation",
+        ),
+        ('[board]\ncolumns="nine"\nrows=6\nsquare=0.06\n', "[board]: expected columns and rows"),
+        ("[board]\ncolumns=9\nrows=1\nsquare=0.06\nviews=[]", "[board]: expected columns and"),
     ],
 )
 def test_bad_views_are_refused(

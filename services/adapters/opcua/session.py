@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import logging
 import time
 from collections.abc import Mapping
 from typing import Any, Final
@@ -43,9 +44,11 @@ class OpcUaSession(Driver):
     interval: float = key(0.05, "s between two notifications of the server")
     patience: float = key(4.0, "s for an answer of the server")
     certificate: str = key("", "file (.der or .pem); with it the session is encrypted")
-    private_key: str = key("", "file of its key (.pem)")
+    private_key: str = key("", "file of its key (.der or .pem)")
     server_certificate: str = key("", "file of the server's certificate: only it is trusted")
-    application_uri: str = key("urn:petrobot", "as in the certificate")
+    application_uri: str = key("", "without it that of the certificate")
+    user: str = key("", "name of the user, if the server asks for one")
+    password_file: str = key("", "file with the user's password")
     insecure: bool = key(False, "allow a session without security beyond this host")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
@@ -57,8 +60,15 @@ class OpcUaSession(Driver):
             import asyncua  # noqa: F401 - late: it takes long, and is an extra
         except ImportError as fault:
             raise ImportError('OPC UA needs asyncua: pip install "petrobot[opcua]"') from fault
-        names = (self.certificate, self.private_key, self.server_certificate)
-        self._files = [(name, ports.file(name)) for name in names] if self.certificate else []
+        # Its warnings repeat, at each attempt, what `faults` says once.
+        logging.getLogger("asyncua").setLevel(logging.ERROR)
+        self._keys: dict[str, tuple[Any, bytes, str]] = {}
+        """By key: what the file holds, its content, "der" or "pem"."""
+        self._password = ports.file(self.password_file).decode().strip("\r\n") if self.user else ""
+        if self.user and not self._password:
+            raise ValueError(f"password_file: {self.password_file} is empty")
+        if self.certificate:
+            self._read_keys()
         self.values: dict[str, Any] = {}
         self.faults = {"session": "no session yet"}
         self._asked = self._done = 0
@@ -68,6 +78,10 @@ class OpcUaSession(Driver):
         self._session = SessionThread(self._serve)
 
     def _check_keys(self) -> None:
+        if "@" in self.url:  # messages quote the address: this one must not
+            raise ValueError("url: expected no login in it; write user and password_file")
+        if bool(self.user) != bool(self.password_file):
+            raise ValueError("user: write user and password_file, or neither")
         host = urlsplit(self.url).hostname
         if not self.url.startswith("opc.tcp://") or not host:
             raise ValueError(f"url: expected opc.tcp://HOST:PORT, found {self.url!r}")
@@ -86,6 +100,40 @@ class OpcUaSession(Driver):
         for name in (*self.on_stop, *(event["node"] for event in self.events.values())):
             if name not in self.nodes:
                 raise ValueError(f"no node {name!r}; there are {', '.join(self.nodes)}")
+
+    def _read_keys(self) -> None:
+        """Read the certificates and the key. Raises ValueError if they do not fit together."""
+        from cryptography import x509
+        from cryptography.hazmat.primitives import serialization
+
+        for name in ("certificate", "private_key", "server_certificate"):
+            path, secret = getattr(self, name), name == "private_key"
+            data = self.ports.file(path)
+            form = "pem" if b"-----BEGIN" in data else "der"
+            place, kind = (serialization, "private_key") if secret else (x509, "x509_certificate")
+            load = getattr(place, f"load_{form}_{kind}")
+            try:
+                loaded = load(data, None) if secret else load(data)
+            except TypeError:
+                raise ValueError(f"{name}: {path} has a password: no node can type one") from None
+            except ValueError:
+                expected = f"expected a {name.split('_')[-1]} (.der or .pem)"
+                raise ValueError(f"{name}: {expected}, {path} is something else") from None
+            self._keys[name] = loaded, data, form
+        mine = self._keys["certificate"][0]
+        if self._keys["private_key"][0].public_key() != mine.public_key():
+            raise ValueError(f"private_key: {self.private_key} is not that of {self.certificate}")
+        try:
+            names = mine.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            uris = names.get_values_for_type(x509.UniformResourceIdentifier)
+        except x509.ExtensionNotFound:
+            uris = []
+        self.application_uri = self.application_uri or next(iter(uris), "")
+        if uris and self.application_uri not in uris:
+            raise ValueError(
+                f"application_uri: expected that of {self.certificate} ({', '.join(uris)}), found "
+                f"{self.application_uri!r}: servers compare them"
+            )
 
     # --- driver ---------------------------------------------------------------------------------
 
@@ -171,27 +219,75 @@ class OpcUaSession(Driver):
     async def _serve(self, session: SessionThread) -> None:
         """One session."""
         from asyncua import Client
-        from asyncua.crypto import security_policies
+        from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
         from asyncua.crypto.uacrypto import CertProperties
 
         client = Client(self.url, timeout=self.patience)
-        client.application_uri = self.application_uri
-        if self._files:
-            mine, secret, server = (
-                CertProperties(data, name.rpartition(".")[2]) for name, data in self._files
-            )
-            policy = security_policies.SecurityPolicyBasic256Sha256
-            await client.set_security(policy, mine, secret, server_certificate=server)
+        client.application_uri = self.application_uri or "urn:petrobot"
         client.session_timeout = KEPT
-        async with client:
-            try:
-                await self._serve_session(client, session)
-            except (TimeoutError, ConnectionError):
-                # A frozen server would not answer the goodbye either. asyncua may already take
-                # itself for disconnected, and then leaves this socket open.
-                if protocol := client.uaclient.protocol:
-                    protocol.disconnect_socket()
-                raise
+        if self.user:
+            client.set_user(self.user)
+            client.set_password(self._password)
+        try:
+            if self._keys:
+                own, secret, server = (CertProperties(*file[1:]) for file in self._keys.values())
+                await client.set_security(
+                    SecurityPolicyBasic256Sha256, own, secret, server_certificate=server
+                )
+            await client.connect()
+        except Exception as fault:
+            if why := await self._refusal(fault):
+                raise ConnectionError(why) from fault
+            raise
+        try:
+            await self._serve_session(client, session)
+        except (TimeoutError, ConnectionError):
+            # A frozen server would not answer the goodbye either. asyncua may already take
+            # itself for disconnected, and then leaves this socket open.
+            if protocol := client.uaclient.protocol:
+                protocol.disconnect_socket()
+            raise
+        finally:
+            await client.disconnect()
+
+    async def _refusal(self, fault: Exception) -> str:
+        """Return why the server gives no session, and by which key; empty if it is just away."""
+        from asyncua import Client
+        from asyncua.crypto import security_policies as policies
+        from cryptography.hazmat.primitives.serialization import Encoding
+
+        code = type(fault).__name__
+        if code.startswith(("BadIdentityToken", "BadUserAccessDenied")):
+            login = f"user {self.user!r} with the password in {self.password_file}"
+            no_login = "anybody without a name: write user and password_file"
+            return f"user: the server does not accept {login if self.user else no_login}"
+        if self._keys and code == "BadCertificateTimeInvalid":
+            own = self._keys["certificate"][0]
+            span = f"{own.not_valid_before_utc:%Y-%m-%d} to {own.not_valid_after_utc:%Y-%m-%d}"
+            return f"certificate: {self.certificate} is valid from {span}: renew it ({fault})"
+        if self._keys and code.startswith("BadCertificate"):
+            return f"certificate: the server does not accept {self.certificate}: {fault}"
+        try:
+            offers = await Client(
+                self.url, timeout=self.patience
+            ).connect_and_get_server_endpoints()
+        except Exception:
+            return ""
+        kind = "Basic256Sha256" if self._keys else "None"
+        policy, mode = getattr(policies, f"SecurityPolicy{kind}").URI, 3 if self._keys else 1
+        fitting = [e for e in offers if (e.SecurityPolicyUri, e.SecurityMode) == (policy, mode)]
+        if not fitting:
+            have = {
+                f"{e.SecurityPolicyUri.split('#')[-1]} {e.SecurityMode.name.strip('_')}"
+                for e in offers
+            }
+            keys = "Basic256Sha256 SignAndEncrypt" if self._keys else "None: write a certificate"
+            return f"certificate: the server offers only {', '.join(sorted(have))}, and not {keys}"
+        if self._keys:
+            pinned = self._keys["server_certificate"][0].public_bytes(Encoding.DER)
+            if all(bytes(e.ServerCertificate or b"")[: len(pinned)] != pinned for e in fitting):
+                return f"server_certificate: {self.server_certificate} is not that of this server"
+        return ""
 
     async def _serve_session(self, client: Any, session: SessionThread) -> None:
         """Subscribe to the nodes; write what is sent until the session shall end."""

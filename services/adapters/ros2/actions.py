@@ -202,9 +202,10 @@ async def follow_joint_trajectory(
     points = [
         {
             "positions": [float(p) for p in point],
-            "time_from_start": {"sec": int(t), "nanosec": round((t - int(t)) * 1e9) % 10**9},
+            "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
         }
-        for point, t in zip(positions, times, strict=True)
+        # thirty steps of 0.1 s are 2.9999999999999996 s
+        for point, nanoseconds in zip(positions, (round(t * 1e9) for t in times), strict=True)
     ]
     defaults = {
         "action_type": "control_msgs/action/FollowJointTrajectory",

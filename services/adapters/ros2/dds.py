@@ -6,7 +6,9 @@ DDS cannot write the request ids of services and actions.
 
 from __future__ import annotations
 
+import base64
 import math
+import time
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -49,6 +51,8 @@ class Types:
             if interface not in self._known:
                 raise ValueError(f"definitions: expected the .msg file of {interface}")
             package, _, name = interface.split("/")
+            if wide := [n for n, f in self._known[interface].items() if f.type == "wstring"]:
+                raise ValueError(f"{interface}: {wide[0]} is a wstring, which DDS cannot send here")
             parts = {n: self._field(f) for n, f in self._known[interface].items()}
             self._made[interface] = make_idl_struct(
                 name, f"{package}::msg::dds_::{name}_", parts or {EMPTY: idl.uint8}
@@ -56,8 +60,6 @@ class Types:
         return self._made[interface]
 
     def _field(self, field: Field) -> Any:
-        if field.type == "wstring":
-            raise ValueError("wstring cannot be sent over DDS")
         one = _BASIC.get(field.type) or self.of(field.type)
         if not field.array:
             return one
@@ -65,8 +67,11 @@ class Types:
             return idl.sequence[one]
         return idl.sequence[one, field.size] if field.bounded else idl.array[one, field.size]
 
-    def make(self, interface: str, message: Message) -> IdlStruct:
-        """Return a message as DDS sends it; fields that are not given are 0, "" or empty."""
+    def make(self, interface: str, message: Any) -> IdlStruct:
+        """Return a message as DDS sends it; fields that are not given are 0, "" or empty. What
+        rosbridge understands besides is understood here, too: a time "now", and base64."""
+        if message == "now":
+            message = dict(zip(("sec", "nanosec"), divmod(time.time_ns(), 10**9), strict=True))
         filled = {
             name: self._value(field, message.get(name))
             for name, field in self._known[interface].items()
@@ -79,6 +84,8 @@ class Types:
                 return BASIC[field.type][-1]() if value is None else value
             return self.make(field.type, value or {})
         one = Field(field.type)
+        if isinstance(value, str):
+            value = base64.b64decode(value, validate=True)
         absent = [None] * (0 if field.size is None or field.bounded else field.size)
         return [self._value(one, item) for item in (absent if value is None else value)]
 
@@ -88,7 +95,7 @@ def plain(sample: Any) -> Any:
     if is_dataclass(sample):
         names = [each.name for each in fields(sample)]
         return {name: plain(getattr(sample, name)) for name in names if name != EMPTY}
-    if isinstance(sample, list | tuple):
+    if isinstance(sample, list | tuple | bytes | bytearray):  # bytes: an array of fixed size
         return [plain(item) for item in sample]
     return None if isinstance(sample, float) and not math.isfinite(sample) else sample
 

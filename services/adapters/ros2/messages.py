@@ -110,17 +110,20 @@ def fits(message: Message, when: Mapping[str, Any]) -> bool:
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*/(msg|srv|action)/[A-Z][A-Za-z0-9]*")
 _FIELD = re.compile(
-    r"(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<size>\d*)\])?\s+"
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<longest>\d+))?(?P<array>\[(?P<bound><=)?(?P<size>\d*)\])?\s+"
     r"(?P<name>[a-z]\w*)(?:\s+\S.*)?"
 )
 _CONSTANT = re.compile(r"[a-z]\w*(?:<=\d+)?\s+[A-Z]\w*\s*=.*")
 _PARTS = {"msg": ("",), "srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
 _BYTES = ("uint8", "byte", "char")
+_FLOAT32 = 3.4028235e38
+"""The largest float32."""
 _INTEGERS = {
     **{f"int{n}": (-(2 ** (n - 1)), 2 ** (n - 1) - 1) for n in (8, 16, 32, 64)},
     **{f"uint{n}": (0, 2**n - 1) for n in (8, 16, 32, 64)},
     **dict.fromkeys(_BYTES, (0, 255)),
 }
+_RANGES: Mapping[str, tuple[float, float]] = {**_INTEGERS, "float32": (-_FLOAT32, _FLOAT32)}
 BASIC: Mapping[str, tuple[type, ...]] = {
     **dict.fromkeys(_INTEGERS, (int,)),
     **dict.fromkeys(("float32", "float64"), (int, float)),
@@ -139,6 +142,8 @@ class Field:
     size: int | None = None
     """Length of the array: exactly, or at most if `bounded`; None for any."""
     bounded: bool = False
+    longest: int | None = None
+    """Bytes of the longest text; None for any."""
 
 
 Definitions = Mapping[str, Mapping[str, Field]]
@@ -159,9 +164,9 @@ def read(interface: str, text: str, source: str) -> dict[str, dict[str, Field]]:
             found = _FIELD.fullmatch(code)
             if found is None:
                 raise ValueError(f"{source}:{number}: expected `type name`, found {code!r:.60}")
-            size = int(found["size"]) if found["size"] else None
-            full = _full(found["type"], package)
-            parts[-1][found["name"]] = Field(full, bool(found["array"]), size, bool(found["bound"]))
+            size, longest = (int(found[n]) if found[n] else None for n in ("size", "longest"))
+            full, array, bound = _full(found["type"], package), found["array"], found["bound"]
+            parts[-1][found["name"]] = Field(full, bool(array), size, bool(bound), longest)
     names = _PARTS[kind]
     if len(parts) != len(names):
         raise ValueError(
@@ -179,8 +184,9 @@ def faults(value: Any, kind: str, known: Definitions, path: str = "") -> list[st
     """Return what does not fit the definition of a message, or a basic type; nothing about messages
     without a definition."""
     if kind in BASIC:
-        low, high = _INTEGERS.get(kind, (-math.inf, math.inf))
-        fit = type(value) in BASIC[kind] and (kind not in _INTEGERS or low <= value <= high)
+        low, high = _RANGES.get(kind, (-math.inf, math.inf))
+        odd = isinstance(value, float) and not math.isfinite(value)  # a float32 has them, too
+        fit = type(value) in BASIC[kind] and (kind not in _RANGES or odd or low <= value <= high)
         return [] if fit else [f"{path}: expected {kind}, found {str(value)[:40]!r}"]
     if kind == "builtin_interfaces/msg/Time" and value == "now":  # rosbridge's word
         return []
@@ -200,6 +206,8 @@ def faults(value: Any, kind: str, known: Definitions, path: str = "") -> list[st
 
 def _faults_of_field(value: Any, field: Field, known: Definitions, path: str) -> list[str]:
     if not field.array:
+        if field.longest is not None and len(str(value).encode()) > field.longest:
+            return [f"{path}: expected at most {field.longest} bytes, found {str(value)[:40]!r}"]
         return faults(value, field.type, known, path)
     if isinstance(value, str) and field.type in _BYTES:
         return []  # base64
@@ -209,5 +217,6 @@ def _faults_of_field(value: Any, field: Field, known: Definitions, path: str) ->
     if size is not None and (many > size if field.bounded else many != size):
         word = "at most" if field.bounded else "exactly"
         return [f"{path}: expected {word} {size} values, found {many}"]
-    each = (faults(item, field.type, known, f"{path}.{n}") for n, item in enumerate(value))
+    one = Field(field.type, longest=field.longest)
+    each = (_faults_of_field(item, one, known, f"{path}.{n}") for n, item in enumerate(value))
     return [fault for found in each for fault in found]

@@ -22,7 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.services.comm.protocol.security import is_loopback
-from petrobot.services.comm.streams.capture import CaptureImages, RecordedImages, settings_of
+from petrobot.services.comm.streams.capture import (
+    CaptureImages,
+    RecordedImages,
+    settings_of,
+    without_login,
+)
 from petrobot.services.comm.streams.image import Image, ImageSource
 
 Clock = Callable[[], float]
@@ -375,8 +380,9 @@ def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
         return RecordedImages(target, clock, colour=settings_of(config).colour)
     if kind not in ("capture", "file") and target.isidentifier():
         return _own_source(kind, target)(config, clock)
+    shown = without_login(source)
     raise ValueError(
-        f'source = {source!r}: use "sim", "capture:0", "capture:/dev/v4l/by-id/...", a URL as in '
+        f'source = {shown!r}: use "sim", "capture:0", "capture:/dev/v4l/by-id/...", a URL as in '
         '"capture:rtsp://...", "file:PATH", or "MODULE:CLASS" for a class of your own'
     )
 

@@ -12,6 +12,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class CaptureImages:
         self, target: int | str, clock: Clock, settings: CaptureSettings | None = None
     ) -> None:
         self._target = target
-        self._name = f"camera {_without_login(target)!r}"
+        self._name = f"camera {without_login(target)!r}"
         self._clock = clock
         self._settings = settings or CaptureSettings()
         self._lock = threading.Lock()
@@ -73,6 +74,8 @@ class CaptureImages:
         self._rate = 0.0
         self._began = 0.0
         self._fault = ""
+        self._came = 0.0
+        """When the last image came, or the camera was started."""
         self._tried = threading.Event()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
@@ -80,6 +83,9 @@ class CaptureImages:
     @property
     def condition(self) -> str:
         """Why no images come; empty while they come or none was asked for."""
+        silent = self._clock() - self._came
+        if not self._fault and self._rate and silent > max(SILENCE_MS / 1000, 2.0 / self._rate):
+            return f"{self._name} has given no image for {silent:.0f} s"
         return self._fault
 
     def start(self, rate: float) -> None:
@@ -87,10 +93,10 @@ class CaptureImages:
         ConnectionError with the source and the reason while it gives none."""
         with self._lock:
             self._newest, self._sequence, self._rate = None, 0, rate
-            self._began = self._clock()
+            self._began = self._came = self._clock()
         if self._thread is None:
             self._tried.clear()
-            self._ended.clear()
+            self._ended = threading.Event()  # the old one ends a thread that still waits in OpenCV
             self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
             self._thread.start()
         if not self._tried.wait(OPEN_LIMIT):
@@ -139,33 +145,48 @@ class CaptureImages:
             wait = min(2.0 * wait, LONGEST_WAIT)
 
     def _closed(self) -> str:
-        text = f"{self._name} cannot be opened: is it plugged in, is the address right?"
-        if "://" in str(self._target):
-            text += " Does it want a login, as in http://USER:PASSWORD@HOST/?"
-        if _is_pipeline(self._target) and not _has_gstreamer():
-            text += " This OpenCV was built without GStreamer."
-        return text
+        text = f"{self._name} cannot be opened: "
+        if not isinstance(self._target, int) and "://" in self._target:
+            text += (
+                "is it plugged in, is the address right? "
+                "Does it want a login, as in http://USER:PASSWORD@HOST/?"
+            )
+        elif not _is_pipeline(self._target):
+            return text + _obstacle(self._target)
+        else:
+            text += "is it plugged in, is the pipeline right?"
+        name = "GStreamer" if _is_pipeline(self._target) else "FFmpeg"
+        return text if _has(name) else f"{text} This OpenCV was built without {name}"
 
     def _take(self, capture: Any, ended: threading.Event) -> int:
         """Take images until the camera is lost or closed; return how many came."""
-        count = 0
+        count, settings = 0, self._settings
         while not ended.is_set() and capture.grab():
             grabbed = self._clock()
             if self._rate:
                 taken, pixels = capture.retrieve()
                 if not taken:
                     break
-                if not self._settings.colour:
-                    pixels = grey(pixels)
+                pixels = _wanted(pixels, settings.colour)
+                if not count and "://" not in str(self._target):  # a stream's sender decides
+                    self._compare(pixels.shape)
                 with self._lock:
                     if self._rate and grabbed >= self._began:
                         time = grabbed - self._settings.latency
                         self._newest = Image(pixels, time, self._sequence)
                         self._sequence += 1
             count += 1
-            self._fault = ""
+            self._fault, self._came = "", grabbed
             self._tried.set()
         return count
+
+    def _compare(self, shape: tuple[int, ...]) -> None:
+        """Warn if the camera gives another size than it was asked for: OpenCV does not."""
+        high, wide = shape[:2]
+        asked = self._settings.width or wide, self._settings.height or high
+        if asked != (wide, high):
+            text = "%s was asked for images of %dx%d and gives %dx%d"
+            _log.warning(text, self._name, *asked, wide, high)
 
 
 class RecordedImages:
@@ -236,6 +257,17 @@ def grey(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
+def _wanted(pixels: NDArray[Any], colour: bool) -> NDArray[np.uint8]:
+    """Return an image of a camera as its table wants it. Raises ValueError if it is not one."""
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[:, :, 0]
+    if pixels.dtype != np.uint8:
+        raise ValueError(f"expected 8 bits for each grey level or colour, found {pixels.dtype}")
+    if colour and (pixels.ndim != 3 or pixels.shape[2] != 3):
+        raise ValueError(f"expected colours, found {pixels.shape}; or remove colour = true")
+    return pixels if colour else grey(pixels)
+
+
 @contextlib.contextmanager
 def _opened(target: int | str, settings: CaptureSettings, rate: float) -> Iterator[Any]:
     """Open a camera and set it up; None if it cannot be opened."""
@@ -258,7 +290,7 @@ def _opened(target: int | str, settings: CaptureSettings, rate: float) -> Iterat
         for name, value in _properties(settings, rate):
             # Network streams accept none of them, which is normal: their sender decides.
             if not capture.set(getattr(cv2, name), value) and "://" not in str(target):
-                shown = _without_login(target)
+                shown = without_login(target)
                 _log.warning("camera %r does not accept %s = %g", shown, name, value)
         yield capture
     finally:
@@ -281,19 +313,35 @@ def _properties(settings: CaptureSettings, rate: float) -> Iterator[tuple[str, f
         yield "CAP_PROP_EXPOSURE", settings.exposure
 
 
-def _without_login(target: int | str) -> int | str:
+def without_login(target: Any) -> Any:
     """Return it as the operator's page and the log may show it."""
-    return re.sub(r"(?<=://)[^/\s]*@", "", target) if isinstance(target, str) else target
+    if not isinstance(target, str):
+        return target
+    shown = re.sub(r"(?<=://)[^/\s]*@", "", target)
+    return re.sub(r"\b(user|password|passwd|\w*-pw|\w*-id)=\S+", r"\1=...", shown)
 
 
 def _is_pipeline(target: int | str) -> bool:
     return isinstance(target, str) and "!" in target and "://" not in target.split("!")[0]
 
 
-def _has_gstreamer() -> bool:
+def _has(name: str) -> bool:
+    """Whether OpenCV was built with GStreamer or FFmpeg."""
     import cv2  # see the module's docstring
 
-    return bool(cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER))
+    return bool(cv2.videoio_registry.hasBackend(getattr(cv2, f"CAP_{name.upper()}")))
+
+
+def _obstacle(target: int | str) -> str:
+    """Return why a camera of this host may not open."""
+    path = Path(f"/dev/video{target}" if isinstance(target, int) else target)
+    if not path.exists():
+        return f"is it plugged in, is the address right? There is no {path}"
+    if path.is_file():
+        return f'it is a file; of a recording write "file:{path}"'
+    if not os.access(path, os.R_OK | os.W_OK):
+        return f"this user may not open {path}; put it into the group video"
+    return "does another program or device use it?"
 
 
 def settings_of(config: Mapping[str, Any]) -> CaptureSettings:

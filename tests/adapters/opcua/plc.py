@@ -1,4 +1,5 @@
-"""A simulated PLC for tests, in a separate process: `plc.py PORT [CERTIFICATE KEY CLIENT]`.
+"""A simulated PLC for tests, in a separate process: `plc.py PORT [CERTIFICATE KEY CLIENTS
+[USER PASSWORD]]`.
 
 The node `manner` decides how `request` is acknowledged: "good", "silent", "stuck" (never
 withdrawn), "blind" (it has a bad status once the request is withdrawn). Other values let something
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from asyncua import Server, ua
-from asyncua.crypto.permission_rules import SimpleRoleRuleset
+from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
 
@@ -32,8 +33,27 @@ ABSTRACT = {"level": ua.NodeId(ua.ObjectIds.Number)}
 """Data types that a node declares in place of that of its value."""
 
 
-async def secure(server: Server, certificate: str, key: str, clients: str) -> None:
-    """Accept only encrypted sessions of clients with these certificates."""
+class Guard:
+    """Accepts one user with one password, and nobody without a name."""
+
+    def __init__(self, user: str, password: str) -> None:
+        self.known = user, password
+
+    def get_user(
+        self,
+        iserver: Any,
+        username: str | None = None,
+        password: str | None = None,
+        certificate: Any = None,
+    ) -> User | None:
+        return User(role=UserRole.Admin) if (username, password) == self.known else None
+
+
+async def secure(server: Server, certificate: str, key: str, clients: str, *login: str) -> None:
+    """Accept only encrypted sessions of clients with these certificates, and of one user."""
+    if login:
+        server.iserver.set_user_manager(Guard(*login))
+        server.set_identity_tokens([ua.UserNameIdentityToken])
     server.set_security_policy(
         [ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt], SimpleRoleRuleset()
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import ipaddress
+import re
 import signal
 import subprocess
 import sys
@@ -356,8 +357,8 @@ def test_an_unknown_command_is_refused(cell: Cell, body: Any) -> None:
         cell.driver().command(0.0, body)
 
 
-def certificate(folder: Path, name: str, uri: str) -> None:
-    """Write NAME.der, NAME.pem (its key)."""
+def certificate(folder: Path, name: str, uri: str, days: int = 9) -> None:
+    """Write NAME.der, valid for so many days since yesterday, and NAME.pem (its key)."""
     x509 = pytest.importorskip("cryptography.x509")
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import rsa
@@ -374,7 +375,7 @@ def certificate(folder: Path, name: str, uri: str) -> None:
         [x509.ExtendedKeyUsageOID.CLIENT_AUTH, x509.ExtendedKeyUsageOID.SERVER_AUTH]
     )
     made = x509.CertificateBuilder(who, who, key.public_key(), x509.random_serial_number())
-    made = made.not_valid_before(begin).not_valid_after(begin + datetime.timedelta(days=9))
+    made = made.not_valid_before(begin).not_valid_after(begin + datetime.timedelta(days))
     for extension in (x509.SubjectAlternativeName(other), usage, ends):
         made = made.add_extension(extension, critical=False)
     signed = made.sign(key, hashes.SHA256())
@@ -388,26 +389,85 @@ def certificate(folder: Path, name: str, uri: str) -> None:
     )
 
 
-@pytest.mark.processes
-def test_a_secured_server_accepts_only_its_certificate(cell: Cell) -> None:
+@pytest.fixture
+def keys(cell: Cell) -> dict[str, Any]:
+    """A PLC that wants certificates and a login, and the keys of a driver that it accepts."""
     folder = cell.folder
-    for name in ("plc", "me", "stranger"):
-        certificate(folder, name, "urn:petrobot")
+    for name in ("plc", "me", "stranger", "old"):
+        certificate(folder, name, "urn:mine", days=1 if name == "old" else 9)
     (folder / "trusted").mkdir()
-    (folder / "trusted" / "me.der").write_bytes((folder / "me.der").read_bytes())
-    cell.security = (str(folder / "plc.der"), str(folder / "plc.pem"), str(folder / "trusted"))
+    for name in ("me", "old"):
+        (folder / "trusted" / f"{name}.der").write_bytes((folder / f"{name}.der").read_bytes())
+    (folder / "password").write_text("geheim77\n")
+    (folder / "wrong").write_text("falsch77\n")
+    (folder / "empty").write_text("\n")
+    plc = [str(folder / name) for name in ("plc.der", "plc.pem", "trusted")]
+    cell.security = (*plc, "anna", "geheim77")
+    own = {"certificate": "me.der", "private_key": "me.pem", "server_certificate": "plc.der"}
+    return {**own, "user": "anna", "password_file": "password"}
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"user": "", "password_file": ""}, "user: .*write user and password_file"),
+    ({"password_file": "wrong"}, "user: .*'anna' with the password in wrong"),
+    ({"user": "otto"}, "user: .*'otto' with the password in password"),
+    ({"certificate": "stranger.der", "private_key": "stranger.pem"}, "certificate: .*stranger.der"),
+    ({"certificate": "old.der", "private_key": "old.pem"}, "certificate: old.der is valid from"),
+    ({"server_certificate": "stranger.der"}, "server_certificate: stranger.der is not that of"),
+    ({"certificate": ""}, "certificate: the server offers only Basic256Sha256 SignAndEncrypt, and"),
+]
+
+
+@pytest.mark.processes
+def test_a_secured_server_says_what_it_does_not_accept(
+    cell: Cell, keys: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each wrong certificate or login is one message with the key that is wrong, and no secret."""
     cell.power(True)
-
-    def driver(who: str, server: str = "plc.der") -> OpcUaSession:
-        own: dict[str, Any] = {"certificate": f"{who}.der", "private_key": f"{who}.pem"}
-        return cell.driver(**own, server_certificate=server)
-
-    trusted = driver("me")
+    trusted = cell.driver(**keys)
     await_(trusted, complete, "all values")
     assert done(trusted, {"count": 2}) == ""
-    for refused in (driver("stranger"), driver("me", "stranger.der"), cell.driver()):
-        state = await_(refused, lambda state: "trying again" in str(state["faults"]), "the refusal")
-        assert not state["up"]
+    drivers = [(cell.driver(**{**keys, **wrong}), words) for wrong, words in REFUSED]
+    for driver, words in drivers:
+        state = await_(driver, lambda state: "trying again" in str(state["faults"]), words)
+        assert not state["up"] and re.search(words, state["faults"]["session"]), state["faults"]
+        assert "geheim77" not in str(state) and "falsch77" not in str(state)
+    assert "geheim77" not in caplog.text and "falsch77" not in caplog.text
+    lines = [record for record in caplog.records if record.name.startswith("asyncua")]
+    assert [line for line in lines if "no longer valid" not in line.message] == []
+
+
+@pytest.mark.processes
+def test_an_open_server_that_should_be_secured(cell: Cell, keys: dict[str, Any]) -> None:
+    cell.security = ()
+    cell.power(True)
+    driver = cell.driver(**keys)
+    state = await_(driver, lambda state: "trying again" in str(state["faults"]), "the refusal")
+    assert "offers only None None, and not Basic256Sha256" in state["faults"]["session"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (
+            {"certificate": "password"},
+            "certificate: expected a certificate .*password is",
+        ),
+        ({"private_key": "me.der"}, "private_key: expected a key"),
+        ({"private_key": "stranger.pem"}, "private_key: stranger.pem is not that of me.der"),
+        ({"application_uri": "urn:other"}, r"expected that of me.der \(urn:mine\), found"),
+        ({"password_file": ""}, "user: write user and password_file"),
+        ({"user": ""}, "user: write user and password_file"),
+        ({"password_file": "empty"}, "password_file: empty is empty"),
+        ({"url": "opc.tcp://anna:geheim77@127.0.0.1:1"}, "url: expected no login"),
+    ],
+)
+def test_keys_that_do_not_fit_are_refused_at_the_start(
+    cell: Cell, keys: dict[str, Any], wrong: dict[str, str], words: str
+) -> None:
+    with pytest.raises(ValueError, match=words) as refused:
+        cell.driver(**{**keys, **wrong})
+    assert "geheim77" not in str(refused.value)
 
 
 @pytest.mark.processes

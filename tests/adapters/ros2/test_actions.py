@@ -598,6 +598,12 @@ def test_the_driver_keeps_the_rules() -> None:
             "control_msgs/action/FollowJointTrajectory",
             ("trajectory.points.0.time_from_start", {"sec": 1, "nanosec": 250_000_000}),
         ),
+        (
+            actions.follow_joint_trajectory,
+            {"joints": ["a"], "positions": [[0.5]], "times": [sum([0.1] * 30)], "expect": {}},
+            "control_msgs/action/FollowJointTrajectory",
+            ("trajectory.points.0.time_from_start", {"sec": 3, "nanosec": 0}),
+        ),
     ],
 )
 def test_shipped_goals(

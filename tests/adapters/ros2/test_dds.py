@@ -43,6 +43,7 @@ TYPES = [
     "tf2_msgs/msg/TFMessage",
     "trajectory_msgs/msg/JointTrajectory",
     "diagnostic_msgs/msg/DiagnosticArray",
+    "unique_identifier_msgs/msg/UUID",
 ]
 
 
@@ -137,6 +138,69 @@ TWIST = "geometry_msgs/msg/Twist"
 SPEED = {"topic": "/cmd_vel", "type": TWIST, "fields": ["linear.x", "angular.z"]}
 
 
+ODD = {
+    "odd/msg/In": "int64 big\nuint64 huge\nfloat64[] far\nbool[3] flags",
+    "odd/msg/Odd": """\
+int32 X=-123
+string NAME="a # b"
+odd/In[] inners
+In[2] two
+In[<=3] most
+string<=4[<=2] words
+byte raw
+char letter
+byte[2] raws
+char[] letters
+uint8[16] uuid
+int8[] small
+float32[3] singles
+builtin_interfaces/Time stamp
+builtin_interfaces/Duration[] spans
+std_msgs/Empty[] nothings
+uint16 with_default 7
+bool last
+""",
+    "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
+    "std_msgs/msg/Empty": "# nothing",
+}
+
+
+def test_unusual_messages() -> None:
+    """Nested arrays of messages, 64 bits, bytes of fixed number, texts of base64 and "now"."""
+    store = rosbags.get_typestore(rosbags.Stores.EMPTY)
+    for name, text in ODD.items():
+        store.register(rosbags.get_types_from_msg(text, name))
+    types, inner = dds.Types(known(ODD)), {"big": -(2**63), "huge": 2**64 - 1, "far": [1e308]}
+    message = {
+        "inners": [{**inner, "flags": [True, False, True]}] * 2,
+        "most": [{"big": 2**53 + 1}],
+        "words": ["äö", ""],
+        "raw": 255,
+        "letter": 65,
+        "raws": [0, 255],
+        "letters": "AP8=",
+        "uuid": list(range(240, 256)),
+        "small": [-128, 127],
+        "singles": [float("nan"), float("-inf"), 0.5],
+        "stamp": "now",
+        "spans": [{"sec": -1, "nanosec": 999_999_999}] * 3,
+        "nothings": [{}, {}],
+        "last": True,
+    }
+    assert definitions.faults(message, "odd/msg/Odd", known(ODD)) == []
+    sample = types.make("odd/msg/Odd", message)
+    sent = bytes(sample.serialize())
+    theirs = bytes(store.serialize_cdr(store.deserialize_cdr(sent, "odd/msg/Odd"), "odd/msg/Odd"))
+    assert sent.rstrip(b"\0") == theirs.rstrip(b"\0")
+    got = dds.plain(type(sample).deserialize(theirs))
+    assert got["uuid"] == message["uuid"] and got["letters"] == [0, 255] == got["raws"]
+    assert got["inners"][1]["huge"] == 2**64 - 1 and got["most"][0]["big"] == 2**53 + 1
+    assert got["singles"] == [None, None, 0.5] and got["nothings"] == [{}, {}]
+    assert abs(got["stamp"]["sec"] - time.time()) < 600.0
+    assert definitions.unfit(got, gaps=True) == ""
+
+
 def test_topics_through_a_domain() -> None:
     """Two participants: set points in one direction, an event and a value in the other."""
     store = rosbags.get_typestore(rosbags.Stores.ROS2_JAZZY)
@@ -170,7 +234,7 @@ def test_topics_through_a_domain() -> None:
     [
         ({}, "a/msg/B", "expected the .msg file of a/msg/B"),
         ({"a/msg/B": "C inner"}, "a/msg/B", "expected the .msg file of a/msg/C"),
-        ({"a/msg/B": "wstring text"}, "a/msg/B", "wstring"),
+        ({"a/msg/B": "wstring text"}, "a/msg/B", "a/msg/B: text is a wstring"),
     ],
 )
 def test_a_type_that_cannot_be_made_is_refused(

@@ -30,6 +30,8 @@ string<=5[<=2] few "no"
 bool flag true
 byte raw
 uint8[] blob
+string<=3 name
+float32 share
 Point[] points
 """
 
@@ -55,6 +57,10 @@ def test_a_result_differs_between_distributions() -> None:
         ({"any": 3}, "any: expected a list of int8"),
         ({"three": [1, 2]}, "three: expected exactly 3 values, found 2"),
         ({"few": ["a", "b", "c"]}, "few: expected at most 2 values, found 3"),
+        ({"few": ["abcde", "äöüß"]}, "few.1: expected at most 5 bytes, found 'äöüß'"),
+        ({"name": "abcd"}, "name: expected at most 3 bytes"),
+        ({"share": 1e39}, "share: expected float32, found '1e+39'"),
+        ({"share": float("nan"), "name": "abc"}, ""),
         ({"flag": 1}, "flag: expected bool"),
         ({"points": [{"x": "far"}]}, "points.0.x: expected float64, found 'far'"),
         ({"points": [3]}, "points.0: expected a table (shapes/msg/Point)"),
