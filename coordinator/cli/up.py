@@ -90,7 +90,7 @@ UNIT = """\
 Description=petrobot nodes of {services}
 Wants=network-online.target
 After=network-online.target
-# A device that is plugged in late is waited for, however often the nodes fail until then.
+# A device may be plugged in late: try again, however often the nodes have failed.
 StartLimitIntervalSec=0
 
 [Service]
@@ -102,7 +102,7 @@ RestartSec=1
 # petrobot stops its nodes itself, devices first; what is left is killed.
 KillMode=mixed
 TimeoutStopSec=10
-# A worker that the kernel kills for want of memory is started again by its node.
+# If the kernel kills a worker because memory is short, its node starts another one.
 OOMPolicy=continue
 # Real-time priority for threads that ask for it (docs/deploy.md):
 #LimitRTPRIO=50

@@ -91,7 +91,7 @@ class TrialWatch(TrialLog):
     def settled(self, now: float, state: State) -> None:
         """Show the figures after each trial, or with many trials after each further 2 %. Count a
         trial when it can no longer change: what is kept must not grow with the run, and all trials
-        counted anew would stop this process for seconds."""
+        counted again would stop this process for seconds."""
         if self._full:
             return
         over = state.mode is Mode.FINISHED

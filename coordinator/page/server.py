@@ -23,7 +23,7 @@ from petrobot.coordinator.page.task_store import TaskStore
 
 PAGE_FILES = (Path(__file__).parent / "static").resolve()
 KEPT = "private, max-age=31536000, immutable"
-"""Lets a browser keep a file of the page for good: another version has other addresses."""
+"""Lets a browser keep a file of the page: another version has other addresses."""
 LAST_COMMANDS_S = 1.0
 """Time for commands to complete at the end (s), among them the one that ended the run (`abort`)."""
 

@@ -38,11 +38,11 @@ FEWEST_VIEWS, FEWEST_KNOWN = 6, 3
 LEAST_TILT, FOCAL_SHARE, SCALE_SHARE = 10.0, 0.02, 0.01
 """Least angle between two boards (degrees); greatest standard deviation of the focal length, as a
 share of it; and greatest share by which distances of boards may be other ones than stated."""
-ASTRAY = 0.05, 5.0
-"""How far (m, degrees) a board may be from where its pose says, by the first estimate: further, and
-the pose is wrong, not inaccurate."""
+WRONG_POSE = 0.05, 5.0
+"""How far (m, degrees) a board may be from where its pose says, by the first estimate: a pose that
+is further off is wrong, not inaccurate."""
 MOST_STEPS = 500
-"""Steps of a fit; one that converges takes some ten."""
+"""Steps of a fit; one that converges takes about ten."""
 LENS = 8
 """Number of lens unknowns: fx fy cx cy k1 k2 p1 p2."""
 
@@ -320,7 +320,7 @@ class _Adjustment:
         # Each known view tells where the base is; those that disagree with most are wrong.
         middle = np.append(np.mean([pose @ self._middle() for *_, pose in known], axis=0)[:3], 1.0)
         bases = [pose @ np.linalg.inv(stated) for _, pose, stated in known]
-        apart = np.array([[_apart(a, b, middle) for a in bases] for b in bases]) / ASTRAY
+        apart = np.array([[_apart(a, b, middle) for a in bases] for b in bases]) / WRONG_POSE
         agree = apart.max(axis=2) <= 1.0
         best = agree[int(agree.sum(axis=1).argmax())]
         if not best.all():

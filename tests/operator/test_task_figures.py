@@ -103,8 +103,8 @@ def watched(task: Task, cell: str) -> tuple[TrialWatch, TrialLog, Feed, int]:
 
 
 def test_what_is_kept_of_trials_does_not_grow_with_the_run() -> None:
-    """All trials were kept and counted anew: after a thousand, that stopped the coordinator for a
-    second again and again."""
+    """All trials were kept and counted again each time: after a thousand, that stopped the
+    coordinator for a second."""
     task = loads(PARTS.format(runs='runs_place = "todo"'))
     _, log, feed, most = watched(task, CELL)
     rows = [TrialRow(t.k, "", 0, t.k, 0, 0.0, t) for t in log.trials]
