@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 OUTPUT_KEPT = 1 << 20
 """Bytes of output that wait for a disk or a terminal; more are lost."""
-OUTPUT_WAIT, LAST_OUTPUT = 0.02, 1.0
+OUTPUT_WAIT, LAST_OUTPUT = 0.1, 1.0
 """How long a process waits for its output to be written, and at its end (s)."""
 LOG_LEVELS = {
     "debug": logging.DEBUG,
@@ -54,8 +54,9 @@ class _Output(io.RawIOBase):
 
     def __init__(self, number: int) -> None:
         self._number = number
+        self._ended = False
         self._begin()
-        atexit.register(self._drain, LAST_OUTPUT)
+        atexit.register(self._end)
 
     def _begin(self) -> None:
         self._process = os.getpid()
@@ -78,6 +79,11 @@ class _Output(io.RawIOBase):
         if self._process != os.getpid():
             self._begin()  # a fork has no copy of the thread
         given = bytes(data)
+        if self._ended:
+            with suppress(OSError):
+                if not self._late:
+                    return os.write(self._number, given)
+            return len(given)
         with self._turn:
             if self._waiting and len(self._waiting) + len(given) > OUTPUT_KEPT:
                 self._lost += len(given)
@@ -92,6 +98,12 @@ class _Output(io.RawIOBase):
         if not self._late:
             self._drain(OUTPUT_WAIT)
         return len(given)
+
+    def _end(self) -> None:
+        """What comes after this is written at once: Python starts no thread any more, or lets none
+        run (it shows the text of SystemExit, and logging closes its files)."""
+        self._drain(LAST_OUTPUT)
+        self._ended = True
 
     def _drain(self, limit: float) -> None:
         with self._turn:
