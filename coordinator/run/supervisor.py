@@ -35,6 +35,7 @@ LAST_WORDS = 0.5
 READY = b"ready"  # what a program prints when others may use it
 LARGEST_LOG = 32 << 20  # of a node (bytes), and as much again in the older part
 LOOK_AT_LOG = 1.0  # pause between looks at its size (s)
+LOG_HANGS = 1.0  # after this time (s) a node that is ready does not wait for its log
 LAST_PART = 1 << 16  # of a log is searched for its last lines (bytes)
 STABLE_AFTER = 10.0  # after this uptime (s) a node starts again without a pause
 
@@ -328,21 +329,26 @@ async def _copy(child: _Child, output: asyncio.StreamReader, log: FileIO) -> Non
     # Not line by line: a line may be longer than the reader's limit, and if the copying ended then,
     # the pipe would fill and block each later action that prints.
     while part := await output.read(1 << 16):
+        writing = on_disk(functools.partial(log.write, part))
         try:
+            said = said[1 - len(READY) :] + part  # the word may come in two parts
+            if READY in said and not told and child.log_fault is None:
+                await asyncio.wait([writing], timeout=LOG_HANGS)
+                if not writing.done() or writing.exception() is None:
+                    told = True
+                    if child.ready.is_set():
+                        _log.warning("node %s is ready again", child.program.name)
+                    child.ready.set()
             with contextlib.suppress(JournalError):  # the disk hangs: what it was given is lost
-                await on_disk(functools.partial(log.write, part))
+                await writing
         except OSError as fault:
             if not child.ready.is_set():
                 child.log_fault = child.log_fault or OSError(
                     fault.errno, fault.strerror, str(child.log)
                 )
                 _signal(child, signal.SIGTERM)
-        said = said[1 - len(READY) :] + part  # the word may come in two parts
-        if READY in said and not told and child.log_fault is None:
-            told = True
-            if child.ready.is_set():
-                _log.warning("node %s is ready again", child.program.name)
-            child.ready.set()
+        finally:
+            writing.cancel()
 
 
 def _signal(child: _Child, number: signal.Signals) -> None:
