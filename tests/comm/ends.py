@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 import zlib
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
@@ -92,6 +93,38 @@ class Coordinator:
     def call(self, id_: str, service: str, **arguments: Any) -> None:
         self.caller.call(self.client.now(), m.Call(id_, service, arguments))
         self.client.flush()
+
+
+@contextlib.asynccontextmanager
+async def slow_line(address: tuple[str, int], **rates: float) -> AsyncIterator[tuple[str, int]]:
+    """Open a line to this address that carries `up` or `down` bytes per second; the other direction
+    is fast. Yield the address of its near end."""
+    ends: list[asyncio.StreamWriter] = []
+
+    async def carry(source: asyncio.StreamReader, to: asyncio.StreamWriter, rate: float) -> None:
+        with contextlib.suppress(ConnectionError):
+            while data := await source.read(1 << 15):
+                to.write(data)
+                await to.drain()
+                await asyncio.sleep(len(data) / rate)
+        to.close()
+
+    async def join(source: asyncio.StreamReader, to: asyncio.StreamWriter) -> None:
+        far = socket.socket()
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
+        far.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(far, address)
+        answers, calls = await asyncio.open_connection(sock=far)
+        ends.extend((to, calls))
+        up, down = rates.get("up", 1e9), rates.get("down", 1e9)
+        await asyncio.gather(carry(source, calls, up), carry(answers, to, down))
+
+    server = await asyncio.start_server(join, "127.0.0.1", 0)
+    yield server.sockets[0].getsockname()
+    for end in ends:
+        end.close()
+    server.close()
+    await server.wait_closed()
 
 
 async def until(condition: Callable[[], bool]) -> None:

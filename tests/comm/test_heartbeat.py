@@ -23,8 +23,20 @@ def test_received_bytes_postpone_the_end() -> None:
     heart = Heartbeat(0.0, LinkTiming())
     for tick in range(1, 40):
         heart.heard = tick * 0.25 - 0.1
+        heart.quiet = 0
         assert heart.advance(heart.due()) is Beat.NOTHING
     assert heart.due() == pytest.approx(10.0)
+
+
+def test_who_only_hears_is_heard() -> None:
+    heart = Heartbeat(0.0, LinkTiming())
+    seen = []
+    for _ in range(4):
+        heart.heard = heart.due()
+        seen.append(heart.advance(heart.due()))
+        if seen[-1] is Beat.PING:
+            heart.quiet = 0
+    assert seen == 2 * [Beat.NOTHING, Beat.PING]
 
 
 @pytest.mark.parametrize(
@@ -50,6 +62,7 @@ def test_what_arrived_while_this_process_was_frozen_is_read_before_the_other_sid
     heart = Heartbeat(0.0, LinkTiming())
     for now in (0.25, 0.5, 0.75):
         assert heart.advance(now) is Beat.PING
+        heart.quiet = 0
     assert heart.advance(1.5) is Beat.NOTHING
     heart.heard = 1.5
     assert heart.due() == 1.5

@@ -13,7 +13,7 @@ from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Answer, Executed, Outcome, Welcome
 from petrobot.services.comm.protocol.security import KeyNeededError
 from tests import waiting
-from tests.comm.ends import Coordinator, Node, until
+from tests.comm.ends import Coordinator, Node, slow_line, until
 
 
 async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
@@ -55,9 +55,11 @@ async def test_calls_of_several_clients_of_a_process_have_different_ids(open_nod
 
 
 async def test_an_accept_behind_many_events_is_not_missed(
-    open_node: Node, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The coordinator needs longer for the events before it than it waits for ACCEPT."""
+    open_node = Node(timing=LinkTiming())
+    await open_node.server.start("127.0.0.1", 0)
     coordinator = open_node.client(timing=LinkTiming())
     coordinator.caller._patience = Patience(accept=0.1)
     longest = [0]
@@ -80,6 +82,44 @@ async def test_an_accept_behind_many_events_is_not_missed(
     assert len([n for n in coordinator.notices if isinstance(n, m.Event)]) == 2000
     assert longest[0] < 200, "so many events are stored before anybody else is heard"
     await coordinator.client.close()
+    await open_node.server.close()
+
+
+@pytest.mark.parametrize("slow", ["up", "down"])
+async def test_large_messages_on_a_slow_line_arrive(slow: str) -> None:
+    """Sent over several times the silence and the wait for ACCEPT."""
+    timing = LinkTiming(heartbeat=0.1, silence=0.5)
+    node = Node(timing=timing)
+    await node.server.start("127.0.0.1", 0)
+    async with slow_line(node.server.address, **{slow: 3e6}) as address:
+        coordinator = Coordinator(*address, timing=timing)
+        coordinator.caller._patience = Patience(accept=0.3)
+        assert await coordinator.client.connected(60.0)
+        image = {"image": bytes(3 << 20)}
+        calls = [coordinator.client.call("echo", image, deadline=0.1) for _ in range(2)]
+        outcomes = await asyncio.wait_for(asyncio.gather(*calls), 60.0)
+        assert [(one.status, one.values) for one in outcomes] == 2 * [("success", image)]
+        assert not any(isinstance(notice, PeerLost) for notice in coordinator.notices)
+        await coordinator.client.close()
+    await node.server.close()
+
+
+async def test_a_node_hears_its_caller_while_a_large_result_is_on_its_way() -> None:
+    timing = LinkTiming(heartbeat=0.1, silence=0.5)
+    node = Node(timing=timing)
+    await node.server.start("127.0.0.1", 0)
+    async with slow_line(node.server.address, down=3e6) as address:
+        coordinator = Coordinator(*address, timing=timing)
+        assert await coordinator.client.connected(60.0)
+        image = {"image": bytes(7 << 20)}
+        large = asyncio.ensure_future(coordinator.client.call("echo", image))
+        await until(lambda: node.server._links["coord"].slow)
+        coordinator.call("1", "move")
+        assert (await node.order(m.Call)).id == "1"
+        assert node.server._links["coord"].slow and not large.done()
+        assert (await asyncio.wait_for(large, 60.0)).values == image
+        await coordinator.client.close()
+    await node.server.close()
 
 
 async def test_a_command_and_an_event(open_node: Node) -> None:

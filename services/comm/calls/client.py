@@ -286,7 +286,7 @@ class Client:
         now = self.now()
         # Not twice in turn: a process that is always late would never give up.
         self._excused = self._alarm.late > STOOD_STILL and not self._excused
-        if self._excused:
+        if self._excused or (self._link is not None and self._link.late(now)):
             self.caller.stood_still(now)
         elif self._link is not None and self._link.behind > self._behind:
             # What we wait for may have come behind what we were reading then.

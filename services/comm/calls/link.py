@@ -53,7 +53,7 @@ class LinkTiming:
     """Times of a connection (s)."""
 
     heartbeat: float = 0.25
-    """After this silence PING is sent."""
+    """PING is sent after this silence, and after twice this time in which nothing was sent."""
     silence: float = 1.0
     """After this silence the other side counts as frozen or cut off."""
     handshake: float = 2.0
@@ -93,10 +93,10 @@ class LinkLimits:
     messages_at_once: int = 20_000
     """Messages that a caller may send at once."""
     buffer_high: int = 1 << 20
-    """Unsent bytes above which a connection is slow: progress and pulses are dropped, and nothing
-    more is read from it."""
+    """Unsent bytes above which a connection is slow: progress and pulses are dropped."""
     buffer_hard: int = 64 << 20
-    """Unsent bytes above which a connection is cut."""
+    """Unsent bytes above which a connection is cut. Above half of them nothing more is read from a
+    caller."""
 
 
 class Beat(Enum):
@@ -110,12 +110,14 @@ class Beat(Enum):
 class Heartbeat:
     """Watches the silence of the other side (sans-I/O)."""
 
-    __slots__ = ("_due", "_read_once", "_timing", "heard")
+    __slots__ = ("_due", "_read_once", "_timing", "heard", "quiet")
 
     def __init__(self, now: float, timing: LinkTiming) -> None:
         self._timing = timing
         self.heard = now
         """When something last arrived (s); set by the reader."""
+        self.quiet = 0
+        """How often `advance` was called since something was sent; set to 0 by the writer."""
         self._due = now + timing.heartbeat
         self._read_once = False
         """Whether it was time to give up, and only what has arrived was still to be read."""
@@ -134,7 +136,11 @@ class Heartbeat:
         self._read_once = False
         self.heard = min(now, self.heard + now - awake)
         self._due = min(now + self._timing.heartbeat, self.heard + self._timing.silence)
-        return Beat.PING if now - self.heard >= self._timing.heartbeat else Beat.NOTHING
+        self.quiet += 1
+        # Who only reads must be heard, too: on a slow line the other side's PING waits behind what
+        # it sends.
+        due = self.quiet > 1 or now - self.heard >= self._timing.heartbeat
+        return Beat.PING if due else Beat.NOTHING
 
     def due(self) -> float:
         """Return when to call `advance` next (s)."""
@@ -211,13 +217,16 @@ class AsyncLink(asyncio.BufferedProtocol):
         self._given = self._first = self._view[:FIRST_READ]
         """What is read into next: only the first part, unless a long message has begun."""
         self.behind = -math.inf
-        """When a read last took all that it could (s): more was probably waiting."""
+        """When a read last took all that it could, or a part of a long frame (s): more was on its
+        way."""
         self._transport: asyncio.Transport | None = None
         self._heart = Heartbeat(0.0, timing)
         self._unheard = 0
         """Bytes of an incomplete frame since the last sign of life."""
         self._timer: asyncio.TimerHandle | None = None
         self._pings = 0
+        self._asked: tuple[int, float] | None = None
+        """The first PING without its PONG: its number, and when it was sent (s)."""
         self._opening = True
 
     # For subclasses.
@@ -267,7 +276,6 @@ class AsyncLink(asyncio.BufferedProtocol):
             self._refuse(now, fault)
             return
         self._given = self._view if full and not messages else self._first
-        self.behind = now if full else self.behind
         if self._logs:  # kinds and ids alone: results may hold tickets
             named = [f"{type(one).__name__} {getattr(one, 'id', '')}" for one in messages]
             _log.debug("received %d bytes: %s", nbytes, ", ".join(named))
@@ -275,6 +283,9 @@ class AsyncLink(asyncio.BufferedProtocol):
         if messages or self._unheard >= HEARD:
             self._heart.heard = now
             self._unheard = 0
+            self.behind = self.behind if messages else now
+        if full:
+            self.behind = now
         if len(messages) == 1 and type(messages[0]) not in _OWN and not self._opening:
             self.took(now, messages)
             return
@@ -297,6 +308,9 @@ class AsyncLink(asyncio.BufferedProtocol):
             if not self.beaten(now, len(pings)):
                 return
             messages = [message for message in messages if type(message) not in _HEARTBEATS]
+            answered = max((one.number for one in pings if type(one) is Pong), default=0)
+            if self._asked is not None and answered >= self._asked[0]:
+                self._asked = None
             self.send([Pong(ping.number) for ping in pings if type(ping) is Ping])
         if messages:
             self.took(now, messages)
@@ -307,12 +321,11 @@ class AsyncLink(asyncio.BufferedProtocol):
 
     def pause_writing(self) -> None:
         self.slow = True
-        if self.connection.side is Side.SERVER and self._transport is not None:
-            self._transport.pause_reading()
 
     def resume_writing(self) -> None:
         self.slow = False
         if self.connection.side is Side.SERVER and self._transport is not None:
+            self._heart.heard = self.now()  # the silence was ours if reading was paused
             self._transport.resume_reading()
 
     def connection_lost(self, fault: Exception | None) -> None:
@@ -336,6 +349,11 @@ class AsyncLink(asyncio.BufferedProtocol):
             self._timer.cancel()
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
 
+    def late(self, now: float) -> bool:
+        """Return whether the other side may not have read yet what was sent: it has not answered a
+        PING for a while, as on a slow line with much to carry."""
+        return self._asked is not None and now - self._asked[1] > self.timing.heartbeat
+
     def send(self, messages: Sequence[Message]) -> None:
         """Send messages in one write. `unsendable` replaces a message that no frame can carry."""
         if self.frames:
@@ -343,6 +361,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         transport = self._transport
         if transport is None or transport.is_closing():
             return
+        self._heart.quiet = 0
         transport.write(self._all_bytes(messages))
         if self.slow:
             self._bear(transport)
@@ -352,6 +371,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         if self.slow or self.frames or self._transport is None or self._transport.is_closing():
             self.send((message,))
             return
+        self._heart.quiet = 0
         self._transport.write(self._bytes(message))
 
     def write(self) -> None:
@@ -360,13 +380,17 @@ class AsyncLink(asyncio.BufferedProtocol):
         transport = self._transport
         if transport is None or transport.is_closing():
             return
+        self._heart.quiet = 0
         transport.write(frames[0] if len(frames) == 1 else b"".join(frames))
         if self.slow:
             self._bear(transport)
 
     def _bear(self, transport: asyncio.Transport) -> None:
-        if transport.get_write_buffer_size() > self.limits.buffer_hard:
-            self.cut(f"it does not read: more than {self.limits.buffer_hard} bytes wait for it")
+        waiting, hard = transport.get_write_buffer_size(), self.limits.buffer_hard
+        if waiting > hard:
+            self.cut(f"it does not read: more than {hard} bytes wait for it")
+        elif waiting > hard / 2 and self.connection.side is Side.SERVER:
+            transport.pause_reading()
 
     def _all_bytes(self, messages: Sequence[Message]) -> bytes:
         if not self.slow and not self._opening:
@@ -448,6 +472,7 @@ class AsyncLink(asyncio.BufferedProtocol):
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
         if beat is Beat.PING:
             self._pings += 1
+            self._asked = self._asked or (self._pings, now)
             self.send((Ping(self._pings),))
 
 
