@@ -221,7 +221,8 @@ class JointMotion:
         if self.goal is None and self._rate <= 0.0:
             self.halt(self.q)
         elif self.goal is not None and self._far[-1] - self._at < 1e-9:
-            self.q, self._way, self._rate = list(self.goal), [], 0.0
+            self.q, self._at = list(self.goal), self._far[-1]
+            self._way = self._way if self._rate else []  # its rate is 0 from the next period on
         else:
             n = next((n for n, far in enumerate(self._far) if far >= self._at), -1)
             span = self._far[n] - self._far[n - 1]

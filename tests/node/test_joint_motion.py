@@ -75,6 +75,25 @@ def test_set_points_keep_speed_and_acceleration_and_arrive_together(
     assert not motion.moving
 
 
+@settings(max_examples=60)
+@given(st.lists(st.tuples(st.floats(-1.5, 1.5), st.floats(-3.0, 3.0)), min_size=2, max_size=4))
+def test_a_way_that_begins_as_soon_as_the_last_has_ended_keeps_the_acceleration(
+    goals: list[tuple[float, float]],
+) -> None:
+    motion = moved()
+    seen = [list(motion.q)]
+    for goal in goals:
+        motion.begin([goal])
+        for _ in range(1000):
+            if motion.moving:
+                motion.step()
+                seen.append(list(motion.q))
+        assert motion.arrived and motion.q == list(goal)
+    for joint in zip(*seen, strict=True):
+        rates = [0.0, *((after - at) / DT for at, after in pairwise(joint)), 0.0]
+        assert all(abs(b - a) <= 8.0 * DT + 1e-9 for a, b in pairwise(rates))
+
+
 def test_it_takes_as_long_as_its_trapezoid() -> None:
     motion = moved()
     motion.begin([[1.0, 2.0]])
