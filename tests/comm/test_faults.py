@@ -95,7 +95,7 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         told = Told(port)
         await told.begin()
         # Longer than any wait here: only the refusing port can end the run.
-        told.caller._patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
+        told.caller.patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
         process.kill()
         ended = await told.until(Outcome)
     assert (ended.cause, ended.executed) == (

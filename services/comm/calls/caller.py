@@ -408,15 +408,15 @@ class Caller:
         """A time that is never later than `due` (s). A shell whose timer is not set for later need
         not compute `due`, which is slower."""
         self._auto_ack = auto_ack
-        self._patience = patience or Patience()
-        self._absence = PeerAbsence(peer, self._patience)
+        self.patience = patience or Patience()
+        self._absence = PeerAbsence(peer, self.patience)
         self._pending = PendingCalls()
         self.pending: Collection[str] = self._pending.keys()
         """Ids of the calls without a result."""
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
-        self._settled = FinishedCalls(self._patience.acknowledge)
+        self._settled = FinishedCalls(self.patience.acknowledge)
         self._messages: list[m.Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
@@ -493,7 +493,7 @@ class Caller:
             again,
         )
         if self.up:
-            due = now + self._patience.accept
+            due = now + self.patience.accept
             self._pending[id] = PendingCall(call, not boot, now, waiter, True, False, None, due)
             self._pending.watch_new(due, id)
             self._messages.append(call)
@@ -524,7 +524,7 @@ class Caller:
             return
         pending.cancel = reason
         self._pending.release(now, id)
-        self._watch(pending, now + (self._patience.stop if within is None else within))
+        self._watch(pending, now + (self.patience.stop if within is None else within))
         if self.up:
             self._messages.append(m.Cancel(id, reason))
 
@@ -547,8 +547,8 @@ class Caller:
         if not self.up:
             self._no_answer(command.id, UNREACHABLE)
             return
-        self._commands[command.id] = now + self._patience.answer
-        self.soonest = min(self.soonest, now + self._patience.answer)
+        self._commands[command.id] = now + self.patience.answer
+        self.soonest = min(self.soonest, now + self.patience.answer)
         self._messages.append(replace(command, data=plain(command.data, "data")))
 
     def subscribe(self, now: float, names: Iterable[str], *, fresh: bool = False) -> None:
@@ -713,7 +713,7 @@ class Caller:
         pending.accepted = True
         self._notices.append(accept)
         if pending.call.deadline is not None:
-            self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
+            self._watch(pending, pending.made + pending.call.deadline + self.patience.stop)
 
     def _take_feedback(self, now: float, feedback: m.Feedback) -> None:
         if feedback.id in self._pending:
@@ -733,7 +733,7 @@ class Caller:
     def stood_still(self, at: float) -> None:
         """This process did not listen until `at`. Wait from then on at least as long as for ACCEPT:
         the peer, perhaps on the same host, may have stood still, too."""
-        until = at + self._patience.accept
+        until = at + self.patience.accept
         self._pending.postpone(until)
         self._commands = {id_: max(due, until) for id_, due in self._commands.items()}
 
@@ -747,7 +747,7 @@ class Caller:
                 self._give_up(
                     id_,
                     "not_accepted",
-                    f"{self.peer} did not accept the call within {self._patience.accept:g} s",
+                    f"{self.peer} did not accept the call within {self.patience.accept:g} s",
                 )
         for id_ in self._pending.not_answered(now):
             self._give_up(id_, "no_answer", f"{self.peer} sent no result in time")
@@ -787,7 +787,7 @@ class Caller:
         if pending.sent and not call.again:
             call = pending.call = replace(call, again=True)
         pending.sent, pending.accepted = True, False
-        due = now + self._patience.accept
+        due = now + self.patience.accept
         self._pending.watch_accept(pending, due)
         self._messages.append(call)
         self.soonest = min(self.soonest, due)

@@ -286,11 +286,15 @@ class Client:
         now = self.now()
         # Not twice in turn: a process that is always late would never give up.
         self._excused = self._alarm.late > STOOD_STILL and not self._excused
-        if self._excused or (self._link is not None and self._link.late(now)):
+        link = self._link
+        if self._excused:
             self.caller.stood_still(now)
-        elif self._link is not None and self._link.behind > self._behind:
+        elif link is not None and link.read < now - self.caller.patience.accept:
+            link.ping(now)  # the other side may not even have read the call
+            self.caller.stood_still(now)
+        elif link is not None and link.behind > self._behind:
             # What we wait for may have come behind what we were reading then.
-            self._behind = self._link.behind
+            self._behind = link.behind
             self.caller.stood_still(self._behind)
         self.caller.advance(now)
         self.flush(now)

@@ -227,6 +227,9 @@ class AsyncLink(asyncio.BufferedProtocol):
         self._pings = 0
         self._asked: tuple[int, float] | None = None
         """The first PING without its PONG: its number, and when it was sent (s)."""
+        self.read = 0.0
+        """The other side has surely read what was sent before this time (s): on a slow line with
+        much to carry this is long ago."""
         self._opening = True
 
     # For subclasses.
@@ -310,7 +313,7 @@ class AsyncLink(asyncio.BufferedProtocol):
             messages = [message for message in messages if type(message) not in _HEARTBEATS]
             answered = max((one.number for one in pings if type(one) is Pong), default=0)
             if self._asked is not None and answered >= self._asked[0]:
-                self._asked = None
+                self.read, self._asked = self._asked[1], None
             self.send([Pong(ping.number) for ping in pings if type(ping) is Ping])
         if messages:
             self.took(now, messages)
@@ -343,16 +346,17 @@ class AsyncLink(asyncio.BufferedProtocol):
     def opened(self) -> None:
         """The handshake is finished: start the heartbeat."""
         self._opening = False
-        now = self.now()
+        self.read = now = self.now()
         self._heart = Heartbeat(now, self.timing)
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
 
-    def late(self, now: float) -> bool:
-        """Return whether the other side may not have read yet what was sent: it has not answered a
-        PING for a while, as on a slow line with much to carry."""
-        return self._asked is not None and now - self._asked[1] > self.timing.heartbeat
+    def ping(self, now: float) -> None:
+        """Ask whether the other side has read what was sent: `read` will tell."""
+        self._pings += 1
+        self._asked = self._asked or (self._pings, now)
+        self.send((Ping(self._pings),))
 
     def send(self, messages: Sequence[Message]) -> None:
         """Send messages in one write. `unsendable` replaces a message that no frame can carry."""
@@ -471,9 +475,7 @@ class AsyncLink(asyncio.BufferedProtocol):
             return
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
         if beat is Beat.PING:
-            self._pings += 1
-            self._asked = self._asked or (self._pings, now)
-            self.send((Ping(self._pings),))
+            self.ping(now)
 
 
 def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
