@@ -7,9 +7,12 @@ import argparse
 import asyncio
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from threading import Thread
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
@@ -21,14 +24,18 @@ from petrobot.coordinator.cli.loading import (
     write_json,
 )
 from petrobot.coordinator.cli.options import add_runs_argument
+from petrobot.coordinator.operator.run_address import RunAddress, find_address
+from petrobot.coordinator.run.folder import RESULT, NoRunError, journal_of
+from petrobot.coordinator.run.journal import JournalError, read_header
+from petrobot.services.comm.location_file import Directory, DirectoryError, parse
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.emergency_stop import Stopped
-    from petrobot.coordinator.operator.run_address import RunAddress
-    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot estop"
 HARDWARE = "press the hardware's emergency stop"
+DISK_PATIENCE = 1.0
+"""How long to wait for the folder of runs, and for services.toml (s)."""
 COORDINATOR_PATIENCE = 1.0
 """How long to wait for the coordinator's answer (s). The coordinator is notified after the devices
 were stopped."""
@@ -59,11 +66,19 @@ def run(options: argparse.Namespace) -> int:
     otherwise."""
     from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 
-    address = _address(options)
-    path = options.services or (
-        Path(address.services) if address is not None and address.services else None
-    )
-    directory, begun = _cells(options, path, address)
+    try:
+        address = _in_time(lambda: _address(options), lambda: None)
+        path = options.services or (
+            Path(address.services) if address is not None and address.services else None
+        )
+        directory, begun = _in_time(
+            lambda: _cells(options, path, address),
+            lambda: (_in_time(lambda: load_directory(path), _hangs), None),
+        )
+    except CommandError as fault:
+        if options.clear:
+            raise
+        raise CommandError(fault.code, f"{fault}\nNOTHING WAS STOPPED: {HARDWARE}") from fault
     # The devices of the demo are stopped, too: who presses the button must not wait for this.
     tell_of_demo(path, directory, f", or {HARDWARE}")
     verb = CLEAR if options.clear else STOP
@@ -79,12 +94,38 @@ def run(options: argparse.Namespace) -> int:
     return 0 if answers and all(answer.done for answer in answers) else 3
 
 
+T = TypeVar("T")
+
+
+def _in_time(read: Callable[[], T], otherwise: Callable[[], T]) -> T:
+    """Return what `read` finds on the disk, or `otherwise` if the disk does not answer: a stop must
+    not wait for a folder of runs that hangs."""
+    found = Future[T]()
+
+    def in_thread() -> None:
+        try:
+            found.set_result(read())
+        except BaseException as fault:
+            found.set_exception(fault)
+
+    Thread(target=in_thread, daemon=True).start()  # a daemon does not keep the process from its end
+    try:
+        return found.result(DISK_PATIENCE)
+    except TimeoutError:
+        print(
+            f"a disk has not answered for {DISK_PATIENCE:g} s; going on without what is on it",
+            file=sys.stderr,
+        )
+        return otherwise()
+
+
+def _hangs() -> NoReturn:
+    raise CommandError(2, "services.toml cannot be read: its disk does not answer")
+
+
 def _address(options: argparse.Namespace) -> RunAddress | None:
     """Return the address of the active run, or None. The run names the cell, and its coordinator is
     notified."""
-    from petrobot.coordinator.operator.run_address import find_address
-    from petrobot.coordinator.run.folder import NoRunError
-
     try:
         return find_address(options.run, options.journal)
     except NoRunError as fault:
@@ -122,10 +163,6 @@ def _cells(
 def _begun(run: str, folder: Path) -> tuple[Directory | None, bool]:
     """Return the cell that a run began with, None without such a run in real time, and whether that
     run has ended: nodes of one whose coordinator was killed may still move their devices."""
-    from petrobot.coordinator.run.folder import RESULT, NoRunError, journal_of
-    from petrobot.coordinator.run.journal import JournalError, read_header
-    from petrobot.services.comm.location_file import DirectoryError, parse
-
     try:
         then = read_header(path := journal_of(run, folder))
         if then["mode"] == "realtime":
@@ -154,9 +191,6 @@ async def _tell(address: RunAddress, folder: Path) -> str:
 
 def _is_active(address: RunAddress, folder: Path) -> bool:
     """Whether the run is still active: a run whose devices are stopped may end by itself."""
-    from petrobot.coordinator.operator.run_address import find_address
-    from petrobot.coordinator.run.folder import NoRunError
-
     try:
         return find_address(address.run, folder) == address
     except NoRunError:

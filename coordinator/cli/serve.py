@@ -6,7 +6,7 @@ import argparse
 import asyncio
 import os
 import signal
-from contextlib import nullcontext
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from petrobot.coordinator.cli.options import (
     add_page_port_argument,
     named_port,
 )
+from petrobot.services.host.command_line import done_before
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.station import Station
@@ -100,11 +101,10 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     credentials_of(directory)  # report unusable keys before anything is started
     runs = options.journal or DEFAULT
     try:
-        async with (
-            local_nodes(directory, runs / "logs", mock=options.mock)
-            if options.up
-            else nullcontext()
-        ):
+        async with AsyncExitStack() as nodes:
+            own = local_nodes(directory, runs / "logs", mock=options.mock) if options.up else None
+            if own and not await done_before(stop, nodes.enter_async_context(own)):
+                return 0
             station = Station(
                 directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates
             )

@@ -10,7 +10,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Awaitable
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -26,7 +26,7 @@ from petrobot.coordinator.cli.loading import (
 )
 from petrobot.coordinator.cli.options import add_log_level_argument, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
-from petrobot.services.host.command_line import number
+from petrobot.services.host.command_line import done_before, number
 
 if TYPE_CHECKING:
     from petrobot.services.comm.location_file import Directory
@@ -152,27 +152,18 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     )  # a member of a lock-step cell that died cannot join it again
     supervisor = Supervisor(programs, options.logs, respawn=respawn)
     try:
-        async with supervisor:
+        async with AsyncExitStack() as nodes:
+            if not await done_before(stop, nodes.enter_async_context(supervisor)):
+                return 0
             for name, process in supervisor.process_ids().items():
                 node = directory.nodes[name]
                 print(f"{name:12} ready on {node.host}:{node.port} (process {process})", flush=True)
             print("Ctrl-C stops them all", flush=True)
-            await _until(stop, supervisor.ended() if options.lockstep else None)
+            # Members of a lock-step cell end by themselves.
+            await done_before(stop, supervisor.ended() if options.lockstep else stop.wait())
     except LaunchError as fault:
         raise CommandError(3, str(fault)) from fault
     return 0
-
-
-async def _until(stop: asyncio.Event, ended: Awaitable[None] | None) -> None:
-    """Wait for Ctrl-C, or until all nodes have ended by themselves, as members of a lock-step cell
-    do."""
-    waiting = [
-        asyncio.ensure_future(stop.wait()),
-        *([] if ended is None else [asyncio.ensure_future(ended)]),
-    ]
-    _, pending = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-    for task in pending:
-        task.cancel()
 
 
 # --- one node, or the laboratory ---

@@ -44,6 +44,10 @@ class Store(Protocol):
         done in another thread."""
 
     @property
+    def stood(self) -> float:
+        """Longest time that a write took (s): whoever appends stands still meanwhile."""
+
+    @property
     def safe(self) -> bool:
         """Whether all that was appended is durable."""
 
@@ -72,6 +76,7 @@ class Observer(Protocol):
 class Forgetful:
     """The store of a run without a journal."""
 
+    stood = 0.0
     safe = True
     durable = False
 

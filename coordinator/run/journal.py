@@ -20,6 +20,7 @@ import fcntl
 import os
 import re
 import struct
+import time
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -83,6 +84,8 @@ class JournalWriter:
         """Where to cut the file before anything is appended; None: nowhere."""
         self._syncing = Lock()
         self.syncs = 0
+        self.stood = 0.0
+        """Longest time that a write took (s)."""
         if header is not None:
             try:
                 make_folder(path.parent)
@@ -184,6 +187,7 @@ class JournalWriter:
         if not self._buffer:
             return
         self._written += 1
+        began = time.monotonic()
         try:
             if self._torn is not None:
                 os.ftruncate(self._file, self._torn)
@@ -198,6 +202,8 @@ class JournalWriter:
             raise JournalError(
                 f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
             ) from fault
+        finally:
+            self.stood = max(self.stood, time.monotonic() - began)
         if not kept:
             # The open file has lost its name, so no resume would ever find what is written to it.
             raise JournalError(

@@ -336,12 +336,17 @@ class RealtimeMission:
             self.settle()
         self._look_again(self._loop.time() + PERIOD)
         await self._over.wait()
-        if remark := self._punctuality.remark():
+        stood = self.mission.executor.store.stood
+        remark = self._punctuality.remark()
+        if remark and self._punctuality.worst > stood + WORST:  # else the disk is to blame
             self.mission.remarks["host"] = remark
-        if self._slowest_sync >= SLOW_DISK:
+        if max(self._slowest_sync, stood) >= SLOW_DISK:
             self.mission.remarks["disk"] = (
-                f"orders to devices waited up to {self._slowest_sync:.1f} s for the disk of the "
-                "journal; what failed may be due to that (--journal FOLDER: on a faster disk)"
+                f"orders to devices waited up to {max(self._slowest_sync, stood):.1f} s for the "
+                "disk of the journal"
+                + f", and the coordinator itself stood still for {stood:.1f} s"
+                * (stood >= SLOW_DISK)
+                + "; what failed may be due to that (--journal FOLDER: on a faster disk)"
             )
         if self._fault is not None:
             raise self._fault

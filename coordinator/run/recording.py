@@ -153,6 +153,11 @@ class JournalStore:
         return self.writer.begin_sync()
 
     @property
+    def stood(self) -> float:
+        """Longest time that a write took (s): whoever appends stands still meanwhile."""
+        return self.writer.stood
+
+    @property
     def safe(self) -> bool:
         """Whether all that was appended is durable."""
         return not self.writer.pending

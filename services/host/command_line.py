@@ -22,7 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import asyncio
     from argparse import ArgumentParser, ArgumentTypeError
+    from collections.abc import Coroutine
 
 OUTPUT_KEPT = 1 << 20
 """Bytes of output that wait for a disk or a terminal; more are lost."""
@@ -247,6 +249,23 @@ def reopen_outputs() -> None:
 LAST_THREADS = 0.5
 """How long a process that has finished waits for threads that code of users has left running
 (s)."""
+
+
+async def done_before(over: asyncio.Event, work: Coroutine[Any, Any, object]) -> bool:
+    """Do the work; when `over` is set first, cancel it. Return whether it was done."""
+    import asyncio  # here, because the processes of drivers import this module
+
+    working, ending = asyncio.ensure_future(work), asyncio.ensure_future(over.wait())
+    try:
+        await asyncio.wait({working, ending}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        ending.cancel()
+        working.cancel()
+        await asyncio.wait({working})
+    if working.cancelled():
+        return False
+    working.result()  # raises what it raised
+    return True
 
 
 def leave_threads(code: int) -> None:

@@ -17,9 +17,11 @@ written or is where petrobot is installed, in a folder of the user (`$XDG_STATE_
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
 import os
+import stat
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -159,13 +161,26 @@ def latch_of(source: Path, node: str) -> Latch:
 
 def _read(path: Path) -> frozenset[str]:
     try:
-        path.stat()  # needs no file descriptor: without a free one, a missing file is still missing
-        names = path.read_text(encoding="utf-8").split()
+        names = _text(path).split()
     except FileNotFoundError:
         return frozenset()
     except (OSError, ValueError):
         return frozenset({ALL})
     return frozenset(names) or frozenset({ALL})
+
+
+def _text(path: Path) -> str:
+    """Return what is in a file. Raises OSError; a pipe in its place would hang its reader."""
+    # `stat` needs no file descriptor: without a free one, a missing file is still missing.
+    _must_be_file(path.stat())
+    return path.read_text(encoding="utf-8")
+
+
+def _must_be_file(status: os.stat_result) -> None:
+    if not (
+        stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)
+    ):  # a folder says so itself
+        raise OSError(errno.EINVAL, "not a regular file")
 
 
 def uptime() -> float:
@@ -176,7 +191,7 @@ def uptime() -> float:
 
 def _cleared(path: Path) -> Cleared:
     try:
-        number, *lines = path.read_text(encoding="utf-8").splitlines()
+        number, *lines = _text(path).splitlines()
         at = float(lines[0]) if lines else 0.0
         pairs = (line.split() for line in lines[1:])
         devices = {device: int(last) for device, last in pairs}
@@ -188,6 +203,8 @@ def _cleared(path: Path) -> Cleared:
 
 def _write(path: Path, names: list[str]) -> None:
     make_folder(path.parent)
+    if path.exists():
+        _must_be_file(path.stat())
     write_whole(path, "\n".join(names) + "\n")
 
 

@@ -24,6 +24,7 @@ from petrobot.services.comm.location_file.host_checks import claim, listening
 from petrobot.services.comm.protocol.messages import Call
 from petrobot.services.comm.protocol.security import all_keys, require_key
 from petrobot.services.comm.tls.credentials import credentials
+from petrobot.services.host.command_line import done_before
 from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
 from petrobot.services.node.child import LEAVE_LIMIT, ForkServer
@@ -129,13 +130,12 @@ class NodeShell:
                 await self.server.start(host, port)
             self._serving = True
         except TimeoutError:
-            await self.close()
             late = ", ".join(
                 device or "actions" for device, place in self._workers.items() if not place.ready
             )
-            raise DirectoryError(
-                (f"node {self._name}: {late} not up within {START_LIMIT:g} s",)
-            ) from None
+            await self.close()
+            why = "a driver hangs while it is made, or this host is too busy"
+            raise DirectoryError((f"{late} not up within {START_LIMIT:g} s: {why}",)) from None
         except BaseException:
             await self.close()
             raise
@@ -304,7 +304,8 @@ async def serve(directory: Directory, name: str, text: str, *, mock: str, memory
     shell = NodeShell(directory, name, text, mock=mock, memory=memory)
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, over.set)
-    await shell.start()
+    if not await done_before(over, shell.start()):
+        return
     host, port = shell.server.address
     if not shell.latch.kept:
         folders = " and ".join(str(path.parent) for path in shell.latch.paths)

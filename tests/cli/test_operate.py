@@ -166,6 +166,25 @@ async def test_a_slow_disk_delays_the_robot_and_not_the_coordinator(
     assert "s for the disk of the journal; what failed" in petrobot.mission.remarks["disk"]
 
 
+async def test_a_disk_that_holds_up_a_write_is_named_in_the_result(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The coordinator stands still meanwhile, and its host was blamed."""
+    write, held = os.write, list[int]()
+
+    def slow(file: int, data: bytes) -> int:
+        if not held and Path(f"/proc/self/fd/{file}").readlink().suffix == ".journal":
+            held.append(file)
+            threading.Event().wait(2 * realtime.SLOW_DISK)
+        return write(file, data)
+
+    monkeypatch.setattr(os, "write", slow)
+    await petrobot.working()
+    await petrobot("abort")
+    await petrobot.running
+    assert held and "the coordinator itself stood still for" in petrobot.mission.remarks["disk"]
+
+
 async def test_a_command_is_answered_when_the_run_ends_before_its_disk_has_written(
     petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:

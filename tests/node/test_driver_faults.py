@@ -25,7 +25,7 @@ from petrobot.services.node.worker_host import START_LIMIT
 from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
 from tests.ports import free_ports
-from tests.waiting import Limit, beat
+from tests.waiting import Limit, beat, wait_for
 
 pytestmark = pytest.mark.processes
 FAULTS = {
@@ -317,3 +317,52 @@ def test_a_driver_that_is_broken_from_the_beginning(tmp_path: Path, breaks: str)
     logged = next(line for line in log.splitlines() if " ERROR " in line)[:23]
     broke = datetime.strptime(logged, "%Y-%m-%d %H:%M:%S,%f").timestamp()
     assert one.log.stat().st_mtime - broke < START_LIMIT / 2
+
+
+def hanging(folder: Path) -> tuple[Path, Path]:
+    """The location file of a node with a driver that hangs while it is made, beside others; and the
+    file that is there as soon as it hangs."""
+    file, hung = folder / "services.toml", folder / "hung"
+    hangs = device("hangs").replace("\nbreaks", f'\nfile = "{hung}"\nbreaks')
+    file.write_text(cell(device("good"), hangs))
+    return file, hung
+
+
+@pytest.mark.parametrize("command", ["services only", "coordinator up", "coordinator serve --up"])
+def test_a_node_of_which_a_driver_hangs_at_the_start_ends_when_it_is_told_to(
+    tmp_path: Path, command: str
+) -> None:
+    file, hung = hanging(tmp_path)
+    if "serve" in command:
+        command += f" --page-port {free_ports(1)[0]}"
+    module, *words = command.split()
+    process = subprocess.Popen(
+        [sys.executable, "-m", f"petrobot.{module}", *words, "--services", str(file)],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+        cwd=tmp_path,
+    )
+    wait_for(hung.exists, awaited="the driver that hangs")
+    process.terminate()
+    assert process.wait(PATIENCE) == 0  # not by the limit for its start
+
+
+def test_of_devices_that_start_the_one_that_hangs_is_named(tmp_path: Path) -> None:
+    file, _ = hanging(tmp_path)
+    short = "from petrobot.services.node import realtime; realtime.START_LIMIT = 5.0; "
+    ended = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            f"{short}from petrobot.services.__main__ import main; main()",
+            *("only", "--services", str(file)),
+        ],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    *log, last = ended.stderr.splitlines()
+    late, _, why = last.partition(" not up within 5 s: a driver hangs")
+    ready = {line.split()[-3] for line in log if line.endswith(" is ready")}
+    assert why and "the_hangs" in late and not ready & set(late.replace(",", "").split()), last

@@ -395,12 +395,15 @@ async def test_a_flood_of_messages_is_limited(victim: Start) -> None:
             burst = b"".join(frame(m.Ping(n)) for n in range(4_000))
             sending = asyncio.create_task(_flood(flood, burst))
             about, limit = dict[str, Any](), Limit("the server to notice the flood")
-            while not about.get("faults", {}).get("too_fast") and limit.left():
+            # A part that comes alone may only be delayed: who sends on is disconnected later.
+            while (
+                not about.get("faults", {}).get("too_fast")
+                or ("mallory" in about["connected"]) is not stays
+            ) and limit.left():
                 await good.still_served(30)
                 about = await asyncio.to_thread(one.about)
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
-            assert ("mallory" in about["connected"]) is stays
             flood.writer.transport.abort()  # not closed: closing would wait for unsent data
             await good.still_served()
         assert one.grown() < TOLERATED

@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.estop import HARDWARE
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
 from petrobot.coordinator.operator.emergency_stop import still_stopped
@@ -281,6 +282,42 @@ async def test_a_key_that_cannot_be_used_does_not_keep_a_stop_from_bus_and_latch
     assert "no CAN hub" in out and "latched" in out
     code, out, _ = await finished(petrobot("estop", "--clear", *services))
     assert code == 0 and "No such file" in out and "; its stop is cleared on disk" in out
+
+
+def not_toml(cell: Path) -> None:
+    """A slip of the editor."""
+    cell.write_text("schema = 1\n[nodes.pc")
+
+
+def a_pipe(file: Path) -> None:
+    """Whoever opens it hangs, as on a disk that does not answer."""
+    file.unlink(missing_ok=True)
+    file.parent.mkdir(exist_ok=True, parents=True)
+    os.mkfifo(file)
+
+
+@pytest.mark.parametrize("harm", [not_toml, a_pipe])
+async def test_estop_that_knows_no_node_says_that_nothing_was_stopped(
+    tmp_path: Path, harm: Callable[[Path], None]
+) -> None:
+    """Without a run there is no other record of the cell."""
+    harm(source := cell_in(tmp_path).source)
+    services = ["--services", str(source), "--journal", str(tmp_path)]
+    code, _, said = await finished(petrobot("estop", *services))
+    assert code == 2 and said.endswith(f"\nNOTHING WAS STOPPED: {HARDWARE}\n"), said
+
+
+@pytest.mark.parametrize("file", ["runs/one/operator.json", ".petrobot/motion.stopped"])
+async def test_a_disk_that_hangs_keeps_no_stop_from_the_bus(tmp_path: Path, file: str) -> None:
+    """That of the runs or of the latch: the stop is stored elsewhere."""
+    source = cell_in(tmp_path).source
+    a_pipe(tmp_path / file)
+    services = ["--services", str(source), "--journal", str(tmp_path / "runs")]
+    home = str(tmp_path / "home")
+    code, out, said = await finished(petrobot("estop", *services, XDG_STATE_HOME=home))
+    assert code == 3 and "no CAN hub" in out and " latched: " in out, out + said
+    code, *_ = await finished(petrobot("estop", "--clear", *services, XDG_STATE_HOME=home))
+    assert code == 0
 
 
 async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:

@@ -167,6 +167,9 @@ class Broken:
         self._moving = False
         self._file = config.get("file")
         self._written = ""
+        if self._breaks == "hangs":
+            Path(str(self._file)).touch()
+            never_return()
         self._fail("constructor")
 
     def _fail(self, where: str) -> None:
