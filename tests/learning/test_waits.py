@@ -506,6 +506,52 @@ rest_cut = {{ in = ["rest:preempt=none"], out = ["other"], event = "alarm" }}
 
 
 @pytest.mark.once
+def test_a_latched_event_does_not_wait_on_for_the_next_transition() -> None:
+    """It comes while `early` waits, and is dropped when the run leaves by `left`: `seen` needs one
+    in the second second."""
+    text = """
+schema = 1
+[task]
+name = "next"
+runs_place = "parts"
+goal_transitions = ["seen"]
+final = "parts == 0 and home == 1"
+[errors]
+to = "broken"
+[events.alarm]
+scope = "external"
+memory = "latched"
+[primitive_tasks]
+work = { deadline = 9.0 }
+rest = { deadline = 9.0 }
+[places]
+parts = { kind = "control", tokens = 1 }
+work = { kind = "action" }
+rest = { kind = "action" }
+box = {}
+met = {}
+home = { kind = "control" }
+broken = { kind = "control" }
+[transitions]
+start = { in = ["parts"], out = ["work"] }
+early = { in = ["work:normal"], out = ["home"], event = "alarm" }
+left = { in = ["work:normal"], out = ["box", "rest"], priority = 1 }
+seen = { in = ["box"], out = ["met"], event = "alarm" }
+unseen = { in = ["box", "rest:normal"], out = ["home"] }
+over = { in = ["met", "rest:normal"], out = ["home"] }
+"""
+    task = loads(text, "next.toml")
+    found = missions(task, 1500)
+    share = float(np.mean([trial.goals for trial in found.trials]))
+    assert share == pytest.approx(1 - exp(-1 / MEAN), abs=0.03)
+    measured = measured_from(task, estimates_of(task, rows_of(found.trials), ""))
+    assert forecast(stochastic_view(task, measured)).goals == pytest.approx(share, abs=0.03)
+    training = Training.of(task, found.trials)
+    told = predict(training, Request(1000, choices_of(training), replicates=20, net=True))
+    assert told["figures"]["R_goal"]["value"] == pytest.approx(share, abs=0.03)
+
+
+@pytest.mark.once
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_an_event_that_a_run_awaits_while_it_stays_active_is_measured(memory: str) -> None:
     """It comes within the second of the run in 1 - exp(-1 / MEAN) of the trials."""

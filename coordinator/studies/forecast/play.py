@@ -203,6 +203,17 @@ class _Clocks:
         self.due, self._waiting = self.due[:, kept], self._waiting[:, kept]
         self._pulses = {event: first[kept] for event, first in self._pulses.items()}
 
+    def drop(self, tokens: Codes, now: Values) -> None:
+        """Forget latched events that have come and now wait for none of the transitions for which
+        they waited before the last firing."""
+        for due, members in zip(self.due, self.members, strict=True):
+            come = np.flatnonzero(due <= now)
+            if len(members) > 1 and len(come):
+                able, mine = np.ones(len(come), np.bool_), np.ix_(members, come)
+                waiting = [self._served(self.moves[i], able, tokens[:, come]) for i in members]
+                due[come[~(self._waiting[mine] & waiting).any(axis=0)]] = np.inf
+                self._waiting[mine] = waiting
+
     def wait(self, able: Sequence[Mask], now: Values, tokens: Codes, replicate: Codes) -> Values:
         """Draw when events will come, as soon as they can serve a transition, and forget it when
         they cannot any more. Return when each of the transitions, of which these are `able`, will
@@ -457,6 +468,7 @@ class Play:
         """Fire what needs no time until nothing does."""
         pending = np.zeros((len(self._quick), len(self._column)), np.bool_)
         for _ in range(LONGEST):
+            self._clocks.drop(self._tokens, self._now)
             able = np.array([self._enabled(m) for m in self._quick])
             for i, clock in enumerate(self._latched):
                 if clock is not None:
