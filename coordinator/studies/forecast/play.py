@@ -209,7 +209,7 @@ class _Clocks:
         for due, members in zip(self.due, self.members, strict=True):
             come = np.flatnonzero(due <= now)
             if len(members) > 1 and len(come):
-                able, mine = np.ones(len(come), np.bool_), np.ix_(members, come)
+                able, mine = np.ones(len(come), np.bool_), np.ix_(np.array(members), come)
                 waiting = [self._served(self.moves[i], able, tokens[:, come]) for i in members]
                 due[come[~(self._waiting[mine] & waiting).any(axis=0)]] = np.inf
                 self._waiting[mine] = waiting
