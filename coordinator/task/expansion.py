@@ -72,6 +72,7 @@ def expand(task: Task) -> Task:
     copies: dict[str, tuple[str, ...]] = {}
     if any(p.tries > 1 for p in places.values()):
         places, transitions, copies = _with_tries(places, transitions)
+    held = {p.name: p.holds for p in places.values() if p.holds}
     places, transitions = _plainly(places), _written_first(transitions)
     final = _with_empty_places(task.final, places)
     if (places, transitions, final) == (task.places, task.transitions, task.final):
@@ -85,6 +86,7 @@ def expand(task: Task) -> Task:
         final=final,
         goal_transitions=goals,
         errors_to="",
+        held=held,
     )
 
 

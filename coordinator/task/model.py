@@ -65,6 +65,8 @@ class Task:
     one that the command finds."""
     errors_to: str = ""
     """Place that receives the errors of action places without an `error` arc; empty: none."""
+    held: Mapping[str, tuple[str, ...]] = field(default_factory=dict, compare=False, repr=False)
+    """Of a flat task: the resources that a token in each place stands for, as `holds` said."""
     expansion: Task | None = field(default=None, compare=False, repr=False)
     """The flat task as a journal recorded it, which is what ran; None: `expand` makes it."""
     is_flat: bool = field(default=False, compare=False, repr=False)

@@ -86,9 +86,9 @@ def storm_share(text: str, label: str) -> float:
     return _storm(text, f'LRA=? [ "{label}" ]')
 
 
-def storm_time(text: str, label: str) -> float:
+def storm_time(text: str, label: str, asked: str = "T=?") -> float:
     """Return the mean time (s) until a state with a label, by Storm, from a .drn text."""
-    return _storm(text, f'T=? [ F "{label}" ]')
+    return _storm(text, f'{asked} [ F "{label}" ]')
 
 
 def _storm(text: str, asked: str) -> float:

@@ -110,6 +110,9 @@ def test_a_file_declares_its_encoding(tmp_path: Path, encoding: str) -> None:
         "http://www.pnml.org/version-2009/grammar/highlevelnet",
         "http://www.pnml.org/version-2009/grammar/pt-hlpng",
         "http://www.pnml.org/version-2009/extensions/timednet",
+        "http://www.example.org/timedptnet",
+        "Timed P/T net",
+        "Coloured Petri net",
     ],
 )
 def test_nets_of_other_types_are_refused(tmp_path: Path, kind: str) -> None:
@@ -283,10 +286,10 @@ TAPAAL = (
     '<net active="true" id="N" type="P/T net">\n'
     '<place id="p" initialMarking="2" invariant="&lt; inf" name="p">{marking}</place>\n'
     '<place id="q" initialMarking="0" invariant="&lt; inf" name="q">{sort}</place>\n'
-    '<transition id="t" name="t" player="0" priority="0" urgent="false" {stochastic}/>\n'
+    '<transition id="t" name="t" player="{player}" priority="0" urgent="false" {stochastic}/>\n'
     '<arc id="A1" inscription="[0,inf){pair}" source="p" target="t" {arc} weight="{weight}">'
     '{dots}</arc>\n<arc id="A2" inscription="1" source="t" target="q" type="normal" weight="1"/>\n'
-    '</net><feature isColored="false" isGame="false"/></pnml>'
+    '</net><feature isColored="false" isGame="{game}"/></pnml>'
 )
 DOT_SORT = (
     "<declaration><structure><declarations>{}</declarations></structure></declaration>\n"
@@ -299,6 +302,8 @@ AS_SAVED = {
     "marking": "",
     "sort": "",
     "stochastic": "",
+    "player": "0",
+    "game": "false",
     "pair": "",
     "arc": 'type="timed"',
     "weight": "2",
@@ -336,7 +341,10 @@ def test_files_as_tapaal_saves_them(tmp_path: Path, more: dict[str, str]) -> Non
             {"before": DOT_SORT('<namedsort id="c"><cyclicenumeration/></namedsort>')},
             r":2: declaration: it declares <cyclicenumeration>; it is a coloured net",
         ),
-        (VERSION_4 | {"marking": DOTS("hlinitialMarking", "(3'dot)")}, "2 tokens, and 3 in col"),
+        (
+            VERSION_4 | {"marking": DOTS("hlinitialMarking", "(3'dot)")},
+            r"numbers of tokens \[2, 3\]",
+        ),
         (VERSION_4 | {"dots": DOTS("hlinscription", "1'dot")}, r"it has the weights \[1, 2\]"),
         (VERSION_4 | {"dots": DOTS("hlinscription", "2'x")}, "2'x"),
         ({"before": '<shared-place name="p"/>\n'}, ":2: pnml: element <shared-place> is not read"),
@@ -345,6 +353,10 @@ def test_files_as_tapaal_saves_them(tmp_path: Path, more: dict[str, str]) -> Non
             "export the composed net",
         ),
         ({"before": '<constant name="N" value="x"/>\n'}, ":2: constant N: 'x' has no value"),
+        ({"player": "1"}, ":5: transition t: attribute player is '1'; games are not read: give ev"),
+        ({"game": "true"}, ":8: feature: attribute isGame is 'true'; games are not read"),
+        ({"game": 'false" isOdd="1'}, ":8: feature: unknown attribute isOdd"),
+        ({"arc": 'type="timed" transition="t"'}, ":6: arc A1: unknown attribute transition"),
     ],
 )
 def test_files_of_tapaal_that_say_more_than_a_net(
@@ -354,6 +366,57 @@ def test_files_of_tapaal_that_say_more_than_a_net(
     path.write_text(TAPAAL.format(**AS_SAVED | more), encoding="utf-8")
     with pytest.raises(NetFileError, match=said):
         read_net(path)
+
+
+def test_stochastic_files_of_tapaal_are_read_with_a_note(tmp_path: Path) -> None:
+    path = tmp_path / "net.tapn"
+    text = TAPAAL.format(
+        **AS_SAVED | {"game": 'false" isStochastic="true', "stochastic": 'rate="3"'}
+    )
+    path.write_text(text, encoding="utf-8")
+    assert len([note for note in read_net(path).notes if "not read: give rates" in note]) == 2
+
+
+NOT_T = '<transition id="t"/>'
+OURS = '<transition id="t"><toolspecific tool="petrobot" version="1">{}</toolspecific></transition>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (NOT_T, OURS.format("<prioritty>2</prioritty>"), "our data: unknown element <prioritty>"),
+        (NOT_T, OURS.format("<rate>2</rate><weight>1</weight>"), "a rate and a weight"),
+        (NOT_T, OURS.format("</toolspecific><toolspecific tool='petrobot'>"), "our data twice"),
+        (NOT_T, '<transition id="t"><timed><value>yes</value></timed></transition>', "is 'yes'"),
+        (NOT_T, '<transition id="t"><timed><value>true</value></timed></transition>', "a rate"),
+        (
+            NOT_T,
+            '<transition id="t" priority="2"><priority><value>1</value></priority></transition>',
+            r"priorities \[1, 2\]",
+        ),
+        ('<place id="a">', '<place id="a" initialMarking="7">', r"numbers of tokens \[1, 7\]"),
+        ("<text>1<", "<value>2</value><text>1<", "it has several values"),
+        (">1<", ">Default,1,Default,2<", "says Default twice"),
+    ],
+)
+def test_what_a_net_file_says_twice_or_in_unknown_words(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    path = pnml(tmp_path, LOOP)
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(NetFileError, match=said):
+        read_net(path)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_test_arc_beside_a_normal_one_takes_nothing_more(tmp_path: Path, first: bool) -> None:
+    """Whichever of them comes first in the file."""
+    tested = arc("a", "t", 2, '<type value="test"/>')
+    both = (tested, arc("a", "t")) if first else (arc("a", "t"), tested)
+    path = pnml(tmp_path, place("a", 3) + '<transition id="t"/>' + "".join(both))
+    assert read_net(path).net == Net.build({"a": 3}, {"t": ({"a": 2}, {"a": 1})})
 
 
 TINA_PNML = LOOP.replace(
@@ -449,6 +512,8 @@ def test_large_numbers_of_tina(tmp_path: Path) -> None:
         ("tr t a -> b\ntr a a -> b\n", "net.net:2: a: this id occurs twice"),
         ("|0|\n|\n", "net.net:1: line: a line that begins with '|0|'; a net of TINA"),
         ("tr t a -> b\npl {p\xe9}\n", "net.net:2: file: 'utf-8' codec"),
+        ("tr t [0,w[ [1,2] a -> b\n", "net.net:1: line: '[1,2]' is no name"),
+        ("tr <t> a -> b\n", "net.net:1: line: '<t>' is no name"),
     ],
 )
 def test_faults_of_a_tina_file_have_a_line(tmp_path: Path, text: str, said: str) -> None:

@@ -566,6 +566,24 @@ def test_dot_and_drn() -> None:
     assert sum(rates) == pytest.approx(float(chain.amount.sum()))
 
 
+def test_a_drn_chain_may_begin_without_time() -> None:
+    """A CTMC where the first tangible marking is certain, else a Markov automaton."""
+    arcs = {"l": ({"go": 1}, {"a": 1}), "r": ({"go": 1}, {"b": 1}), "t": ({"a": 1}, {"b": 1})}
+    both = Net.build({"go": 1, "a": 0, "b": 0}, arcs)
+    drn = FORMATS[".drn"].write(
+        NetFile(both, gspn=Gspn.of(both, {"t": 4.0}, weights={"l": 1.0, "r": 3.0}))
+    )
+    assert "@type: Markov Automaton\n" in drn and "@nr_states\n3\n@nr_choices\n3\n" in drn
+    assert drn.endswith(
+        "state 0 !4.0 a\n\taction 0\n\t\t1 : 1.0\n"
+        "state 1 !1.0 deadlock b\n\taction 0\n\t\t1 : 1.0\n"
+        "state 2 !0 init\n\taction 0\n\t\t0 : 0.25\n\t\t1 : 0.75\n"
+    )
+    one = Net.build({"go": 1, "a": 0, "b": 0}, {name: arcs[name] for name in "lt"})
+    drn = FORMATS[".drn"].write(NetFile(one, gspn=Gspn.of(one, {"t": 4.0})))
+    assert "@type: CTMC\n" in drn and "state 0 !4.0 init a\n\taction 0\n\t\t1 : 4.0" in drn
+
+
 def lola_net(text: str) -> Net:
     """Read a LoLA file as its grammar says, with none of the writer's code."""
     net = r"PLACE ([^;]+);\s+MARKING ([^;]*);\s+((?:TRANSITION[^;]+;[^;]+;\s+)+)"

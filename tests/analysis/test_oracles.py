@@ -116,3 +116,23 @@ def test_storm_agrees_on_times(storm: None, tokens: int, rates: list[float]) -> 
     text = written(NetFile(net, gspn=gspn), Path("net.drn"))[0]
     done = chain.space.where(lambda m: m[net.place_index["done"]] > 0)
     assert completion(chain, done).mean == pytest.approx(oracles.storm_time(text, "done"), rel=1e-4)
+
+
+@pytest.mark.parametrize("weights", [{}, {"left": 1.0, "right": 3.0}])
+def test_storm_reads_a_chain_that_begins_without_time(
+    storm: None, weights: dict[str, float]
+) -> None:
+    """Its first tangible marking is certain, or drawn by weight."""
+    arcs: dict[str, tuple[dict[str, int], dict[str, int]]] = {
+        name: ({"go": 1}, {name: 1}) for name in weights or ("left",)
+    }
+    arcs |= {"l": ({"left": 1}, {"right": 1}), "r": ({"right": 1}, {"done": 1})}
+    net = Net.build({"go": 1, "left": 0, "right": 0, "done": 0}, arcs)
+    gspn = Gspn.of(net, {"l": 0.5, "r": 2.0}, weights=weights)
+    text = written(NetFile(net, gspn=gspn), Path("net.drn"))[0]
+    asked = "T=?" if not weights else "Tmax=?"
+    expected = 0.5 + 2.0 * (0.25 if weights else 1.0)
+    assert oracles.storm_time(text, "done", asked) == pytest.approx(expected, rel=1e-4)
+    chain = Chain.of(gspn)
+    mean = completion(chain, chain.space.where(lambda m: m[3] > 0)).mean
+    assert mean == pytest.approx(expected)

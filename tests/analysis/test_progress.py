@@ -427,6 +427,45 @@ def test_tokens_that_came_back_are_not_called_lost() -> None:
     assert verdict.details[0] == "arm: only `parked`, `tired`, `no_park`, `fetched` can fill it"
 
 
+HELD = """
+schema = 1
+[task]
+name = "park"
+final = "parts == 0 and arm == 1"
+[primitive_tasks]
+look = { deadline = 9.0 }
+carry = { deadline = 9.0 }
+[places]
+parts = { kind = "control", tokens = 2 }
+arm = { kind = "resource", tokens = 1 }
+look = { kind = "action", holds = ["arm"] }
+carry = { kind = "action", holds = ["arm"] }
+parked = { holds = ["arm"] }
+[transitions]
+next = { in = ["parts"], out = ["look"] }
+seen = { in = ["look:normal"], out = ["carry"] }
+lost = { in = ["look:error"], out = ["parts"] }
+put = { in = ["carry:normal"], out = ["parked"] }
+dropped = { in = ["carry:error"] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("", ""),
+        ('"parts == 0 and arm == 1"', '"parts == 0 and parked >= 1 and arm == 1"'),
+        ('parked = { holds = ["arm"] }', 'parked = { holds = ["arm"], listen = true }'),
+    ],
+)
+def test_a_place_that_nothing_takes_from_keeps_what_it_holds(old: str, new: str) -> None:
+    """The step that led there is as designed."""
+    verdict = judged(loads(HELD.replace(old, new))).deadlock_free
+    assert verdict.reason.endswith("next needs arm, which is empty")
+    told = "arm: taken by `next`, still held with parked, and no transition takes parked"
+    assert verdict.details[0] == told
+
+
 def test_of_the_copies_that_tries_makes_only_the_nearest_is_told() -> None:
     net: dict[str, dict[str, Any]] = {
         "go": {"in": "parts", "out": "look"},

@@ -408,13 +408,13 @@ def _held(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> list[
     one was lost."""
     if not _since(net, firings, place) or _loser(net, draft, firings, place) is not None:
         return []
-    stands = _stands_for(net, place, _ends(draft))
+    stands = _stands_for(net, place, _ends(draft), _holders(draft, place))
     return [p for p, n in enumerate(draft.marking) if n and p != place and stands.get(p)]
 
 
 def _loser(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> int | None:
     """Return the last firing that lost a token of the place; None if all are still somewhere."""
-    stands = _stands_for(net, place, _ends(draft))
+    stands = _stands_for(net, place, _ends(draft), _holders(draft, place))
     if sum(n * draft.marking[p] for p, n in stands.items()) > net.initial[place] - 0.5:
         return None
     for t in (net.transition_index[name] for name in reversed(firings)):
@@ -424,7 +424,9 @@ def _loser(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> int 
 
 
 @lru_cache(maxsize=64)
-def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, float]:
+def _stands_for(
+    net: Net, place: int, ends: frozenset[int], holders: frozenset[int]
+) -> Mapping[int, float]:
     """Return for how many tokens of the place a token of each other place stands.
 
     The net as it was meant returns what it takes: weights y >= 0 exist that every firing keeps. So
@@ -432,14 +434,14 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
     show the transition that is wrong. What takes or gives tokens of the place itself is believed
     first; what gives nothing at all, last. No place is weighed that nothing takes from, except
     those in `ends`, and none that has tokens at the beginning, such as another resource: a
-    token that arrives there was returned.
+    token that arrives there was returned. In `holders` it is held, as `holds` says.
     """
     from scipy.optimize import linprog
     from scipy.sparse import csr_array
 
     changes = net.compiled.changes
     moved = {p for arcs in net.consume for p, _ in arcs if not net.initial[p]}
-    places = [place, *sorted((moved | ends) - {place})]
+    places = [place, *sorted((moved | ends | holders) - {place})]
     column = {p: i for i, p in enumerate(places)}
     n, m = len(places), len(changes)
     cost, entries = np.full(n + 2 * m, 1e-4), list[tuple[int, int, float]]()
@@ -451,10 +453,21 @@ def _stands_for(net: Net, place: int, ends: frozenset[int]) -> Mapping[int, floa
         cost[n + 2 * t : n + 2 * t + 2] = doubt, 1.5 * doubt
     rows, columns, values = zip(*entries, strict=True)
     equal = csr_array((values, (rows, columns)), shape=(m, n + 2 * m))
-    bounds = [(1.0, 1.0), *[(0.0, None)] * (n - 1 + 2 * m)]
+    bounds = [(1.0, 1.0) if p == place or p in holders else (0.0, None) for p in places]
+    bounds += [(0.0, None)] * (2 * m)
     found = linprog(cost, A_eq=equal, b_eq=np.zeros(m), bounds=bounds, method="highs")
     weights = found.x if found.status == 0 else np.zeros(n)
     return {p: float(weights[i]) for p, i in column.items()}
+
+
+def _holders(draft: Draft, place: int) -> frozenset[int]:
+    """Return the places whose tokens hold the resource in this place by declaration."""
+    net, held = draft.compiled.net, draft.compiled.task.held
+    return frozenset(
+        p
+        for name, names in held.items()
+        if net.places[place] in names and not net.initial[p := net.place_index[name]]
+    )
 
 
 def _ends(draft: Draft) -> frozenset[int]:

@@ -110,15 +110,18 @@ def _lola_list(numbers: Mapping[str, int]) -> str:
 
 
 def write_drn(chain: Chain) -> str:
-    """Return the DRN text of a chain. Raises NetFileError if its initial marking is vanishing.
+    """Return the DRN text of a chain.
 
     States are labelled `init`, `deadlock`, and with the name of each marked place, in which
     everything but letters, digits and _ is replaced by _. A number follows if two would be alike.
+
+    A CTMC starts in one state. A chain whose first tangible marking is drawn is a Markov automaton:
+    its last state takes no time and leads to them.
     """
-    if chain.vanishing[0]:
-        remedy = "a CTMC starts in a tangible marking; give the first transition a rate"
-        raise NetFileError("drn", "init", "the initial marking is vanishing", remedy)
     made = Generator.of(chain)
+    starts = np.flatnonzero(made.start).tolist()
+    drawn = len(starts) > 1
+    count = str(len(made.tangible) + drawn)
     rates = (made.matrix.T * made.rate).tocsr()
     marked = np.stack(
         [chain.space.tokens(p)[made.tangible] > 0 for p in range(len(chain.space.net.places))]
@@ -129,7 +132,7 @@ def write_drn(chain: Chain) -> str:
         taken.add(names[-1])
     lines = [
         "// A GSPN's chain over its tangible markings, rates in 1/s",
-        "@type: CTMC",
+        "@type: Markov Automaton" if drawn else "@type: CTMC",
         "@parameters",
         "",
         "@reward_models",
@@ -137,12 +140,12 @@ def write_drn(chain: Chain) -> str:
     ]
     lines += [
         "@nr_states",
-        str(len(made.tangible)),
+        count,
         "@nr_choices",
-        str(len(made.tangible)),
+        count,
         "@model",
     ]
-    for i, n in enumerate(made.tangible.tolist()):
+    for i in range(len(made.tangible)):
         first, last = rates.indptr[i], rates.indptr[i + 1]
         out = [
             (int(j), float(r))
@@ -152,10 +155,14 @@ def write_drn(chain: Chain) -> str:
         out = [(j, r) for j, r in sorted(out) if r > 0]
         total = sum(r for _, r in out)
         labels = [names[p] for p in np.flatnonzero(marked[:, i]).tolist()]
-        labels = (["init"] if n == 0 else []) + (["deadlock"] if not out else []) + labels
+        labels = (["init"] if starts == [i] else []) + (["deadlock"] if not out else []) + labels
         lines.append(f"state {i} !{total or 1.0!r} {' '.join(labels)}".rstrip())
         lines.append("\taction 0")
-        lines += [f"\t\t{j} : {r!r}" for j, r in out or [(i, 1.0)]]
+        unit = total if drawn else 1.0  # the edges of a Markov automaton are probabilities
+        lines += [f"\t\t{j} : {r / unit!r}" for j, r in out] or [f"\t\t{i} : 1.0"]
+    if drawn:
+        lines += [f"state {len(made.tangible)} !0 init", "\taction 0"]
+        lines += [f"\t\t{i} : {float(made.start[i])!r}" for i in starts]
     return "\n".join(lines) + "\n"
 
 

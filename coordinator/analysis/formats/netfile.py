@@ -147,6 +147,7 @@ class NetDraft:
         self.consume: dict[str, dict[str, int]] = {}
         self.produce: dict[str, dict[str, int]] = {}
         self.inhibit: dict[str, dict[str, int]] = {}
+        self.test: dict[str, dict[str, int]] = {}
         self.rates: dict[str, float] = {}
         self.weights: dict[str, float] = {}
         self.servers: dict[str, int | None] = {}
@@ -173,7 +174,8 @@ class NetDraft:
         """Add a transition. Raises NetFileError if the id is taken."""
         self._fresh(name)
         self.transitions[name], self.lines[name] = priority, self.line
-        self.consume[name], self.produce[name], self.inhibit[name] = {}, {}, {}
+        for table in (self.consume, self.produce, self.inhibit, self.test):
+            table[name] = {}
 
     def _fresh(self, name: str) -> None:
         if name in self.places or name in self.transitions:
@@ -212,7 +214,8 @@ class NetDraft:
                 )
             self.inhibit[transition][place] = min(known or weight, weight)
         elif what == "test":
-            self._test(place, transition, weight)
+            known = self.test[transition].get(place, 0)
+            self.test[transition][place] = max(known, weight)
         else:
             table = (self.consume if into else self.produce)[transition]
             if place in table:
@@ -220,13 +223,6 @@ class NetDraft:
                     f"{element}: parallel arcs between {source} and {target} are added up"
                 )
             table[place] = table.get(place, 0) + weight
-
-    def _test(self, place: str, transition: str, weight: int) -> None:
-        """Add a test arc: take and give back the tokens that are not consumed anyway."""
-        missing = weight - self.consume[transition].get(place, 0)
-        if missing > 0:
-            for table in (self.consume[transition], self.produce[transition]):
-                table[place] = table.get(place, 0) + missing
 
     def number(self, element: str, text: str) -> Fraction:
         """Return the exact value of an expression of numbers, constants, + - * / and parentheses.
@@ -256,7 +252,16 @@ class NetDraft:
         return float(self.number(element, x or "0")), float(self.number(element, y or "0"))
 
     def net(self) -> Net:
-        """Return the net. Raises NetFileError if it is malformed."""
+        """Return the net. Raises NetFileError if it is malformed.
+
+        A test arc takes and gives back what no other arc takes anyway.
+        """
+        for t, tests in self.test.items():
+            for place, weight in tests.items():
+                missing = weight - self.consume[t].get(place, 0)
+                for table in (self.consume[t], self.produce[t]) if missing > 0 else ():
+                    table[place] = table.get(place, 0) + missing
+        self.test.clear()
         try:
             return Net.build(
                 self.places,

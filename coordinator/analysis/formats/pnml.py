@@ -6,8 +6,8 @@ The reader also accepts what tools write beyond the standard:
   GreatSPN and Storm (`type value`), TAPAAL and Romeo (`type` attribute), or in tool-specific data;
 - PIPE: labels in `value` (`Default,1`), rates, timed flags, servers and priorities;
 - TAPAAL: `inputArc`, `outputArc`, `inhibitorArc`, `transportArc`, markings and weights as
-  attributes, if no time interval, invariant or urgent transition restricts the net; what version 4
-  says again in colours, if `dot` is the only one;
+  attributes, if no time interval, invariant or urgent transition restricts the net and it is no
+  game; what version 4 says again in colours, if `dot` is the only one;
 - our own tool-specific data.
 
 `PLACE`, `TRANSITION`, `ARC` and `NET` list everything that is understood; all else is refused.
@@ -21,7 +21,7 @@ most tools read, and the rest as our tool-specific data, which other tools ignor
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from itertools import chain, count
 from xml.etree import ElementTree
@@ -42,6 +42,7 @@ from petrobot.coordinator.analysis.formats.tree import (
     line_of,
     local,
     parse_tree,
+    spoken,
     xml_text,
 )
 
@@ -49,20 +50,11 @@ TOOL = "petrobot"
 NORMAL = {"", "normal", "timed", "place-transition", "transition-place"}
 INHIBITOR = {"inhibitor", "inhibition", "inhibitorarc", "logicalinhibitor", "tapninhibitor"}
 TEST = {"test", "read", "readarc", "testarc", "logicaltest"}
-PLACE_TRANSITION = (
-    "ptnet",
-    "pnmlcoremodel",
-    "p/t net",
-    "petri net",
-    "ptnetb",
-    "ptinhibitornet",
-    "inhibitorptnet",
-    "gspn",
-    "epnml-1.0",
-    "epnml-1.1",
-    "pnml-pt",
-    "laas.fr/tina/tpn",
+PLACE_TRANSITION = re.compile(
+    r"(.*://(.*[/#])?)?(ptnet|pnmlcoremodel|p/t net|petri net|ptnetb|ptinhibitornet|inhibitorptnet"
+    r"|gspn|epnml-1\.[01]|pnml-pt|(www\.)?laas\.fr/tina/tpn)/?"
 )
+"""Types of nets, in lower case: a name, alone or as the last part of an address."""
 
 # --- what is understood ---------------------------------------------------------------------------
 
@@ -75,7 +67,9 @@ DOTS = Only((), UNFOLD, r"\(*[0-9]+'dot(\.all)?\)*")
 """How TAPAAL writes a number of uncoloured tokens beside the plain number."""
 DOT_SORT = {"declaration", "structure", "declarations", "namedsort", "dot"}
 """What the declaration of a file may contain in which `dot` is the only colour."""
-PLAYER = Note(("0", ""), "not read: every transition may fire")
+GAME = "games are not read: give every transition to player 0 and save the net as no game"
+PLAYER = Only(("0", ""), GAME)
+FLAG = Only(("true", "false", ""), "write true or false")
 STOCHASTIC = Note(("", "constant", "1", "1.0"), "not read: give rates with --rates")
 
 DRAWING: dict[str, Known] = dict.fromkeys(
@@ -118,18 +112,19 @@ TRANSITION = Vocabulary(
         "urgent": Only(("false", ""), UNTIMED),
         "priority": READ,
         "distribution": STOCHASTIC,
+        "rate": STOCHASTIC,
         "value": STOCHASTIC,
         "weight": STOCHASTIC,
         "firingMode": DRAWN,
         # Parameters of the distribution, which has a note of its own.
-        **dict.fromkeys(("a", "b", "c", "rate", "mean", "stddev", "shape", "scale", "p"), DRAWN),
+        **dict.fromkeys(("a", "b", "c", "mean", "stddev", "shape", "scale", "p"), DRAWN),
         **dict.fromkeys(("logMean", "logStddev"), DRAWN),
     },
     {
         **NODE_PARTS,
         "rate": READ,
-        "timed": READ,
-        "infiniteServer": READ,
+        "timed": FLAG,
+        "infiniteServer": FLAG,
         "priority": READ,
         "player": PLAYER,
         "urgent": Only(("false", ""), UNTIMED),
@@ -144,7 +139,6 @@ ARC = Vocabulary(
         "id": READ,
         "source": READ,
         "target": READ,
-        "transition": READ,
         "type": READ,
         "arctype": READ,
         "kind": READ,
@@ -174,6 +168,7 @@ OBJECTS = {
     "referencePlace": REFERENCE,
     "referenceTransition": REFERENCE,
     **dict.fromkeys(ARCS, ARC),
+    "transportArc": Vocabulary({**ARC.attributes, "transition": READ}, ARC.children),
 }
 NET = Vocabulary(
     {
@@ -206,7 +201,8 @@ ROOT = Vocabulary(
     {"version": DRAWN},
     {
         "net": READ,
-        **dict.fromkeys(("name", "toolspecific", "queries", "query", "feature"), DRAWN),
+        **dict.fromkeys(("name", "toolspecific", "queries", "query"), DRAWN),
+        "feature": READ,
         "k-bound": DRAWN,
         "declaration": READ,
         "variable": Only((), UNFOLD),
@@ -216,6 +212,23 @@ ROOT = Vocabulary(
     },
     repeated=frozenset({"net", "constant"}),
 )
+FEATURE = Vocabulary(
+    {
+        # Colours and times are refused where they are; TAPAAL says "timed" of most plain nets.
+        **dict.fromkeys(("isColored", "isTimed"), DRAWN),
+        "isGame": Only(("false", ""), GAME),
+        "isStochastic": Note(("false", ""), "not read: give rates with --rates"),
+    }
+)
+OWN = {
+    "place": Vocabulary({"tool": READ, "version": READ}, {"capacity": READ}),
+    "transition": Vocabulary(
+        {"tool": READ, "version": READ},
+        dict.fromkeys(("priority", "rate", "weight", "servers"), READ),
+    ),
+}
+OWN_NOWHERE = Vocabulary({"tool": READ, "version": READ})
+"""Our tool-specific data, by the element that may contain it."""
 
 
 def nodes(net: Element) -> Iterator[Element]:
@@ -247,6 +260,8 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
             file, f"<{local(root)}>", "this is not PNML", "expected <pnml>", line=root.line
         )
     notes = check(file, root, ROOT, "pnml") if local(root) == "pnml" else []
+    for feature in children(root, "feature"):
+        notes += check(file, feature, FEATURE, "feature")
     for part in (part for one in children(root, "declaration") for part in one.iter()):
         if local(part) and local(part) not in DOT_SORT:
             raise NetFileError(
@@ -260,7 +275,7 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
         )
     (net,) = nets
     kind = (net.get("type") or "").strip().lower()
-    if kind and not any(kind.rstrip("/").endswith(known) for known in PLACE_TRANSITION):
+    if kind and not re.fullmatch(PLACE_TRANSITION, kind):
         raise NetFileError(
             file,
             f"net {net.get('id')}",
@@ -308,9 +323,19 @@ class _PnmlReading:
         self.draft.notes += check(self.draft.file, node, known, what)
         for child in node:
             if known.children.get(local(child)) == READ and local(child) not in known.repeated:
-                self.draft.notes += check(
-                    self.draft.file, child, LABEL, f"{what}: <{local(child)}>"
-                )
+                label_of = f"{what}: <{local(child)}>"
+                self.draft.notes += check(self.draft.file, child, LABEL, label_of)
+                if len(list(spoken(child))) > 1:
+                    self.draft.line = line_of(child)
+                    raise self.draft.fault(label_of, "it has several values", "keep one of them")
+        own = [data for data in children(node, "toolspecific") if data.get("tool") == TOOL]
+        for data in own:
+            self.draft.notes += check(
+                self.draft.file, data, OWN.get(local(node), OWN_NOWHERE), f"{what}: our data"
+            )
+        if len(own) > 1:
+            self.draft.line = line_of(own[1])
+            raise self.draft.fault(what, "it has our data twice", "keep one of them")
 
     def result(self, root: Element) -> NetFile:
         """Return everything that was read. Raises NetFileError."""
@@ -318,6 +343,7 @@ class _PnmlReading:
         if self.draft.rates and self.untimed:
             for name in self.untimed:
                 self.draft.weights.setdefault(name, 1.0)
+                self.draft.notes.append(f"transition {name}: without a rate, it is immediate")
         name = (
             label(self.element, "name") or self.element.get("name") or self.element.get("id") or ""
         )
@@ -385,14 +411,11 @@ class _PnmlReading:
     def _place(self, node: Element) -> None:
         name = self._id(node)
         self._check(node, PLACE, f"place {name}")
-        marking = label(node, "initialMarking") or node.get("initialMarking") or "0"
-        tokens = self._count(f"place {name}", marking)
-        dots = self._dots(node, "hlinitialMarking")
-        if dots and self.draft.whole(f"place {name}", dots) != tokens:
-            raise self.draft.fault(
-                f"place {name}", f"{marking} tokens, and {dots} in colours", "give one number"
-            )
-        self.draft.place(name, tokens, self._capacity(node, name))
+        said = label(node, "initialMarking"), node.get("initialMarking")
+        tokens = self._agreed(
+            f"place {name}", "numbers of tokens", (*said, self._dots(node, "hlinitialMarking"))
+        )
+        self.draft.place(name, tokens or 0, self._capacity(node, name))
         self._common(node, name)
 
     def _capacity(self, node: Element, name: str) -> int | None:
@@ -401,6 +424,13 @@ class _PnmlReading:
         if own is not None:
             return self._count(f"capacity of {name}", own)
         return self._count(f"capacity of {name}", label(node, "capacity") or "0") or None
+
+    def _agreed(self, element: str, what: str, said: Iterable[str | None]) -> int | None:
+        """Return the number that all of these say; None if none says any."""
+        counts = {self._count(element, text) for text in said if text}
+        if len(counts) > 1:
+            raise self.draft.fault(element, f"it has the {what} {sorted(counts)}", "give one")
+        return counts.pop() if counts else None
 
     def _count(self, element: str, text: str) -> int:
         """Return a number, also as PIPE writes it: `Default,2` or `Default,2,Red,0`."""
@@ -418,16 +448,24 @@ class _PnmlReading:
                 raise self.draft.fault(
                     element, f"tokens of the colour {coloured[0]!r}", "only plain tokens are read"
                 )
-            text = next((n for colour, n in pairs if colour.lower() == "default"), "0")
+            plain = [n for colour, n in pairs if colour.lower() == "default"]
+            if len(plain) > 1:
+                raise self.draft.fault(element, f"{text!r} says Default twice", "give one number")
+            text = plain[0] if plain else "0"
         return self.draft.whole(element, text or "0")
 
     def _transition(self, node: Element) -> None:
         name, own = self._id(node), own_data(node)
         self._check(node, TRANSITION, f"transition {name}")
-        urgency = own.get("priority") or label(node, "priority") or node.get("priority") or "0"
-        self.draft.transition(name, self.draft.whole(f"priority of {name}", urgency))
+        said = own.get("priority"), label(node, "priority"), node.get("priority")
+        self.draft.transition(name, self._agreed(f"transition {name}", "priorities", said) or 0)
         self._common(node, name)
         rate = own.get("rate") or label(node, "rate")
+        timed = (label(node, "timed") or "").lower() == "true"
+        if "weight" in own and rate is not None:
+            raise self.draft.fault(f"transition {name}", "a rate and a weight", "keep one of them")
+        if timed and rate is None:
+            raise self.draft.fault(f"transition {name}", "timed, but without a rate", "give a rate")
         if "weight" in own:
             self.draft.weights[name] = float(self.draft.number(f"weight of {name}", own["weight"]))
         elif rate is not None:
@@ -457,7 +495,7 @@ class _PnmlReading:
     def _arc(self, node: Element) -> None:
         tag = local(node)
         element = f"{tag} {node.get('id') or '(no id)'}"
-        self._check(node, ARC, element)
+        self._check(node, OBJECTS[tag], element)
         source, target = (
             self._resolved(node.get(end) or "", element) for end in ("source", "target")
         )
@@ -484,14 +522,11 @@ class _PnmlReading:
         for text in interval:
             if not ENDLESS.allows(text):
                 raise self.draft.fault(element, f"the time interval {text}", ENDLESS.remedy)
-        counts = {self._count(element, text) for text in said if text and text not in interval}
-        if len(counts) > 1:
-            raise self.draft.fault(
-                element, f"it has the weights {sorted(counts)}", "give one weight"
-            )
-        if not counts and drawn and not interval:
-            counts = {self._count(element, drawn)}
-        return counts.pop() if counts else 1
+        counts = [text for text in said if text not in interval]
+        if not any(counts) and not interval:
+            counts = [drawn]
+        weight = self._agreed(element, "weights", counts)
+        return 1 if weight is None else weight
 
     def _resolved(self, name: str, element: str) -> str:
         """Return the node at the end of a chain of references."""

@@ -15,6 +15,8 @@ from petrobot.coordinator.task.net import Net
 
 TOKEN = re.compile(r"\s*(\{(?:\\.|[^}\\])*\}|->|[^\s{}#]+)")
 PLAIN = re.compile(r"[A-Za-z_'][A-Za-z0-9_']*\Z")
+BARE = re.compile(r"[\w'.\-]+")
+"""Names that are read without braces; other signs say something else, such as `[1,2]` a time."""
 SCALE = {"K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "P": 10**15, "E": 10**18}
 ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>[0-9]{1,300}[KMGTPE]?)\Z")
 MARKING = re.compile(r"\(([0-9]{1,300}[KMGTPE]?)\)")
@@ -110,7 +112,7 @@ class _TinaReading:
     def _transition(self, words: list[str]) -> None:
         if not words:
             raise self.draft.fault("tr", "a transition without a name", "write tr NAME IN -> OUT")
-        name = _bare(words[0])
+        name = self._named(words[0])
         element = f"transition {name}"
         self.transitions.setdefault(name, self.line)
         rest = self._labelled(name, words[1:])
@@ -124,6 +126,14 @@ class _TinaReading:
                     element, f"a time interval {interval}", "only untimed nets are read; remove it"
                 )
         self._arcs(rest, element, lambda word, first: self._arc(word, name, True, first))
+
+    def _named(self, word: str) -> str:
+        """Return the name that a word gives to a node. Raises NetFileError."""
+        name = _bare(word)
+        if name == word and not BARE.fullmatch(word):
+            problem = f"{word!r} is no name"
+            raise self.draft.fault("line", problem, "write a name with other signs in braces")
+        return name
 
     def _arcs(self, words: list[str], element: str, arc: Callable[[str, bool], None]) -> None:
         """Read `INPUTS -> OUTPUTS`, or nothing; `arc` receives a word and whether it is an
@@ -142,7 +152,8 @@ class _TinaReading:
     def _arc(self, word: str, node: str, of_transition: bool, first: bool) -> None:
         """Read an arc of a node: `first` is an input of it, and leads to or from the node that
         `word` names."""
-        other, suffix = _split(word)
+        name, suffix = _split(word)
+        other = self._named(name) if name else ""
         place, transition = (other, node) if of_transition else (node, other)
         consumes = first == of_transition
         kind, weight = "normal", 1
@@ -167,7 +178,7 @@ class _TinaReading:
     def _place(self, words: list[str]) -> None:
         if not words:
             raise self.draft.fault("pl", "a place without a name", "write pl NAME (TOKENS)")
-        name = _bare(words[0])
+        name = self._named(words[0])
         self.tokens.setdefault(name, 0)
         rest = self._labelled(name, words[1:])
         while rest and (found := MARKING.fullmatch(rest[0])):
@@ -187,8 +198,7 @@ class _TinaReading:
         priority = self._priorities()
         for transition, draft.line in self.transitions.items():
             draft.transition(transition, priority.get(transition, 0))
-        tests_last = sorted(self.arcs, key=lambda arc: arc[3] == "test")
-        for source, target, weight, kind, draft.line in tests_last:
+        for source, target, weight, kind, draft.line in self.arcs:
             draft.arc(source, target, weight, kind, f"transition {_of(draft, source, target)}")
         for name, (_, draft.line) in self.labels.items():
             if name not in draft.places and name not in draft.transitions:
@@ -273,13 +283,13 @@ def _joined(words: list[str]) -> list[str]:
 
 
 def _split(word: str) -> tuple[str, str]:
-    """Return (place, suffix with kind and weight)."""
+    """Return (place as it is written, suffix with kind and weight)."""
     end = (
         word.rindex("}") + 1
         if word.startswith("{")
         else next((i for i, c in enumerate(word) if c in "*?!"), len(word))
     )
-    return _bare(word[:end]), word[end:]
+    return word[:end], word[end:]
 
 
 def _bare(word: str) -> str:

@@ -191,10 +191,16 @@ def label(element: Element, tag: str) -> str | None:
 
 def _said(found: Element) -> str:
     """Return the text of a label's element."""
+    return next(spoken(found), None) or _text(found).strip()
+
+
+def spoken(found: Element) -> Iterator[str]:
+    """Yield the texts that a label says in elements and attributes of their own; one is enough."""
     for inner in found:
         if local(inner) in ("text", "value"):
-            return _text(inner).strip()
-    return (found.get("value") or _text(found)).strip()
+            yield _text(inner).strip()
+    if value := found.get("value"):
+        yield value.strip()
 
 
 def _text(element: Element) -> str:

@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import combinations, combinations_with_replacement, product
+from itertools import combinations, combinations_with_replacement, permutations, product
 from typing import NamedTuple
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView, contended
@@ -1112,9 +1112,15 @@ class _Derivation:
         taken = {p for p, _ in fired.plain} | {
             a.place for a in fired.actions if a.end is not End.GOING
         }
-        both = taken & {p for p, _, _ in fired.produce}
-        others = (x for x in self.droppable if x.index != fired.index)
-        return any(x.bars or both & {p for p, _ in x.needs} for x in others)
+        given = {p for p, _, _ in fired.produce}
+        both = taken & given
+        others = [(x, {p for p, _ in x.needs}) for x in self.droppable if x.index != fired.index]
+        # A latched event that waited for one transition does not wait on for the next one.
+        handed = (
+            {*x.flags} & {*y.flags} and taken & needs and given & more
+            for (x, needs), (y, more) in permutations(others, 2)
+        )
+        return any(x.bars or both & needs for x, needs in others) or any(handed)
 
     def _switch(self, t: Transition) -> float:
         """Return how often an open condition is true, relative to its competitors."""

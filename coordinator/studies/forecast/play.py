@@ -160,8 +160,9 @@ class _Variables:
 
 class _Clocks:
     """When the events and timers come for which transitions wait. Transitions that wait for the
-    same latched event, of which the rate is known, share a clock: the first of them that can fire
-    consumes it. The rate is that of the transitions which the event would serve if it came now."""
+    same event, of which the rate is known, share a clock: the first of them that can fire consumes
+    a latched one, and a pulse serves all. The rate is that of the transitions which the event would
+    serve if it came now."""
 
     def __init__(
         self,
@@ -173,7 +174,7 @@ class _Clocks:
     ) -> None:
         self._s, self._drawer, self._periods = structure, drawer, periods
         self.moves = [m for m in moves if m.waits and not m.cause]
-        shared = [self._is_latched(m) for m in self.moves]
+        shared = [m.memory is not None and not drawer.as_measured(m.name) for m in self.moves]
         clocks: dict[str | int, list[int]] = {}
         for i, m in enumerate(self.moves):
             key = structure.task.transitions[m.name].events[0] if shared[i] else i
@@ -184,7 +185,7 @@ class _Clocks:
             self.moves[i].number: clock
             for clock, members in enumerate(self.members)
             for i in members
-            if shared[i]
+            if shared[i] and self._is_latched(self.moves[i])
         }
         """By transition: the clock of its latched event."""
         self.due = np.full((len(self.members), n), np.inf)
@@ -193,14 +194,25 @@ class _Clocks:
         self._pulses = {event: drawer.chance(n) * s for event, s in periods.items()}
         """By event of a timer: when it comes for the first time. A trial may begin at any time."""
 
-    def _is_latched(self, m: Move) -> bool:
-        latched = m.memory is not None and m.memory[0] is EventMemory.LATCHED
-        return latched and not self._drawer.as_measured(m.name)
+    @staticmethod
+    def _is_latched(m: Move) -> bool:
+        return m.memory is not None and m.memory[0] is EventMemory.LATCHED
 
     def keep(self, kept: Mask) -> None:
         """Continue with some columns."""
         self.due, self._waiting = self.due[:, kept], self._waiting[:, kept]
         self._pulses = {event: first[kept] for event, first in self._pulses.items()}
+
+    def drop(self, tokens: Codes, now: Values) -> None:
+        """Forget latched events that have come and now wait for none of the transitions for which
+        they waited before the last firing."""
+        for due, members in zip(self.due, self.members, strict=True):
+            come = np.flatnonzero(due <= now)
+            if len(members) > 1 and len(come):
+                able, mine = np.ones(len(come), np.bool_), np.ix_(np.array(members), come)
+                waiting = [self._served(self.moves[i], able, tokens[:, come]) for i in members]
+                due[come[~(self._waiting[mine] & waiting).any(axis=0)]] = np.inf
+                self._waiting[mine] = waiting
 
     def wait(self, able: Sequence[Mask], now: Values, tokens: Codes, replicate: Codes) -> Values:
         """Draw when events will come, as soon as they can serve a transition, and forget it when
@@ -223,11 +235,12 @@ class _Clocks:
                     told = moves
                 due[columns] = now[columns] + self._drawn(told, columns, now, replicate)
             due[~served] = np.inf
-            free = np.ones(len(now), np.bool_)  # the event serves one of them
+            free = np.ones(len(now), np.bool_)  # a latched event serves one of them
             for i in sorted(members, key=lambda i: -self.moves[i].priority):
                 first = able[i] & free
                 fires[i, first] = np.maximum(due[first], now[first])
-                free &= ~first
+                if self._is_latched(self.moves[i]):
+                    free &= ~first
         return fires
 
     def _served(self, move: Move, able: Mask, tokens: Codes) -> Mask:
@@ -455,6 +468,7 @@ class Play:
         """Fire what needs no time until nothing does."""
         pending = np.zeros((len(self._quick), len(self._column)), np.bool_)
         for _ in range(LONGEST):
+            self._clocks.drop(self._tokens, self._now)
             able = np.array([self._enabled(m) for m in self._quick])
             for i, clock in enumerate(self._latched):
                 if clock is not None:
@@ -738,11 +752,15 @@ class Play:
         for number in range(len(self._runs.end)):
             self._end_runs(number, np.flatnonzero(moving & (ends <= dues) & (run == number)))
         for clock, members in enumerate(self._clocks.members):
-            for number in members:
-                columns = np.flatnonzero(moving & (dues < ends) & (i == number))
-                if len(columns):
-                    self._clocks.due[clock, columns] = np.inf
-                    self._fire(self._clocks.moves[number], columns)
+            columns = np.flatnonzero(moving & (dues < ends) & np.isin(i, members))
+            self._clocks.due[clock, columns] = np.inf
+            now = due[:, columns] <= dues[columns]  # a pulse serves all that it finds waiting
+            for number in sorted(members, key=lambda k: -self._clocks.moves[k].priority):
+                served, move = columns[now[number]], self._clocks.moves[number]
+                if len(members) > 1 and len(served):
+                    served = served[self._enabled(move)[served]]  # one before may have barred it
+                if len(served):
+                    self._fire(move, served)
         self._free(np.flatnonzero(~moving))
 
     def _end_runs(self, run: int, columns: Codes) -> None:

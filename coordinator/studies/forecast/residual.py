@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2_contingency, rankdata, spearmanr, ttest_ind_from_stats
 
 from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
+from petrobot.coordinator.analysis.time.measured import is_cause
 from petrobot.coordinator.learning.propagation import limits_of
 from petrobot.coordinator.learning.records import WaitEnd
 from petrobot.coordinator.learning.waits import memory_of
@@ -396,7 +397,7 @@ def event_doubts(training: Training) -> list[str]:
                 u is not t
                 and {*t.events} & {*u.events}
                 and not apart
-                and not (by_rate and memory is EventMemory.LATCHED and _by_rate(training, u))
+                and not (by_rate and _by_rate(training, u))
             ):
                 together.setdefault(t.events[0], {}).update({t.name: None, u.name: None})
         if by_rate and memory is EventMemory.LATCHED and reads_variables(flat, t):
@@ -415,8 +416,8 @@ def event_doubts(training: Training) -> list[str]:
 
 def _by_rate(training: Training, t: Transition) -> bool:
     """Return whether the simulated net lets one event come for this transition and others."""
-    waits = training.waits.get(t.name)
-    alone = memory_of(training.task.flat, t) is not None
+    flat, waits = training.task.flat, training.waits.get(t.name)
+    alone = memory_of(flat, t) is not None and not is_cause(flat, t)
     return alone and (waits is None or waits.came is not None)
 
 
