@@ -259,6 +259,14 @@ class HoldsForGood(Axis):
         pass
 
 
+class IsShorter(Axis):
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        if self.goal > 0.15:
+            self.goal = self.at
+            raise ValueError("to: at most 0.15")
+
+
 class WrongAnswer(Axis):
     def hold(self, now: float) -> str:
         super().hold(now)
@@ -530,6 +538,7 @@ class DrawsByItself(Axis):
         (TakesAll, "command: accepted"),
         (HoldsInWords, "hold: answered 'held', and axis[0].at still changes"),
         (HoldsForGood, "release: the movement that was held does not continue"),
+        (IsShorter, "{'to': 0.2}: refused: ValueError: to: at most 0.15"),
         (WrongAnswer, 'hold: expected "held", "cannot hold" or "stopped", got \'ok\''),
         (Waits, "took longer than the period of 0.01 s, the longest"),
         (StrangeState, "state: expected plain data"),
@@ -700,6 +709,13 @@ class StaysAway(Survives):
             super().step(now)
 
 
+class KnowsThatItIsLost(StaysAway):
+    """And its state is never again that of a device that stands still."""
+
+    def stopped(self) -> bool:
+        return not self.lost and super().stopped()
+
+
 class MovesByItself(Survives):
     """With its cable again it goes on with the last command."""
 
@@ -725,6 +741,22 @@ def test_a_cable_that_is_pulled_and_put_back(kind: type[Axis], faults: list[str]
 
     found = checked(kind, cable=cable)
     assert found.faults == faults and not found.notes
+
+
+@pytest.mark.parametrize(
+    ("kind", "faults"),
+    [
+        (Survives, []),
+        (KnowsThatItIsLost, ["cable put back: stopped() is still False after 5 s"]),
+    ],
+)
+def test_the_cable_of_a_driver_that_gets_no_commands(kind: type[Axis], faults: list[str]) -> None:
+
+    def cable(there: bool) -> None:
+        kind.plugged = there
+
+    made = partial(kind, {}, cast(Ports, None))
+    assert check_driver(made, cable=cable, simulated=True).faults == faults
 
 
 class Button(Driver):
