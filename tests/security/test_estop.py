@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli import estop, main
 from petrobot.coordinator.cli.estop import HARDWARE
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
@@ -318,6 +319,22 @@ async def test_a_disk_that_hangs_keeps_no_stop_from_the_bus(tmp_path: Path, file
     assert code == 3 and "no CAN hub" in out and " latched: " in out, out + said
     code, *_ = await finished(petrobot("estop", "--clear", *services, XDG_STATE_HOME=home))
     assert code == 0
+
+
+def test_a_busy_host_is_no_disk_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To read sixty nodes may take it longer than the wait for a disk."""
+    monkeypatch.setattr(estop, "DISK_PATIENCE", 0.05)
+
+    def reads() -> str:
+        until_then = time.process_time() + 0.3
+        while time.process_time() < until_then:
+            pass
+        return "found"
+
+    never = threading.Event()
+    assert estop._in_time(reads, lambda: "not found") == "found"
+    assert estop._in_time(lambda: str(never.wait(60.0)), lambda: "not found") == "not found"
+    never.set()
 
 
 async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
