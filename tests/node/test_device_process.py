@@ -33,6 +33,7 @@ from petrobot.services.worker.remote import (
     NODE_SILENT,
     CyclicDriver,
     DeviceCommand,
+    DeviceError,
     RemoteDriver,
 )
 from tests.node.conftest import Clock
@@ -254,6 +255,22 @@ def test_the_driver_is_stopped_before_the_process_leaves_a_dead_node() -> None:
     process.end()
     assert "stop" in driver.log and driver.closed_while_moving is False
     link.close()
+
+
+def test_a_driver_that_fails_is_stopped_before_its_process_ends() -> None:
+    class Failing(Moving):
+        def step(self, now: float) -> None:
+            if "stop" not in self.log:
+                raise KeyError("the sensor")
+            super().step(now)
+
+    driver = Failing()
+    driver.moving = True
+    (node, loop_end), (near, far) = socket.socketpair(), socket.socketpair()
+    failed = pytest.raises(DeviceError, match="its driver failed: KeyError")
+    with node, loop_end, near, far, failed:
+        DeviceLoop(driver, Ports(), Pipe(loop_end), far).run()  # type: ignore[arg-type]
+    assert "stop" in driver.log and driver.closed_while_moving is False
 
 
 @pytest.mark.parametrize(
