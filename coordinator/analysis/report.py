@@ -1046,6 +1046,8 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
             lines += _recovery_row(f"  {r.name:{wide}}", r, odds)
     if odds.missing:
         return [*lines, f"  no probability: {odds.missing}"]
+    if never := [r.name for r in found if r.name not in odds.by_exit]:
+        lines.append(f"  no probability: by these numbers never taken: {', '.join(never)}")
     told = [text for text in odds.assumptions if not text.endswith(", not measured")]
     if len(told) < len(odds.assumptions):
         told.append("durations and shares as the task file declares them, where not measured")
