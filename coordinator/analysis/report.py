@@ -480,6 +480,8 @@ class Analysis:
         never = "  no run ever reaches `final`, so there is no mean time"
         several = f" of a mission run of {f.trials} trials" if f.trials > 1 else ""
         head = f"forecast{several}: "
+        rare = 0 < done.probability < RARE
+        small = f" (relative error at most {f.completion_error:.0e})" if rare else ""
         exact = self.exact.figures if self.exact else {}
         names = {} if GOALS in f.told else {GOALS: "R_goal"}
         told = ", ".join(
@@ -488,8 +490,8 @@ class Analysis:
         return [
             "",
             *([f"{head}{told} (mean and standard error with exact times)"] if told else []),
-            f"{'with few phases: ' if told else head}P_complete {done.probability:.9f}, {goal}"
-            f"R_conj {f.conjunctive_reliability:.6f}",
+            f"{'with few phases: ' if told else head}P_complete {_share(done.probability, 9)}"
+            f"{small}, {goal}R_conj {_share(f.conjunctive_reliability)}",
             time if done.probability else never,
             *([f"  one trial: {_figures(f.one_trial.told)}"] if several or f.returning else []),
             *(f"  {text}" for text in f.later),
@@ -773,6 +775,8 @@ def _forecast(
 
 LEAST_SHARE = 5e-4
 """Least share of the time from which an action is worth improving: less is printed as 0.0 %."""
+RARE = 1e-3
+"""Shares below it are told with six digits, for six decimals would hide them."""
 AGREE = 1e-6
 """Relative difference up to which a figure of two models counts as the same: both are solved to
 about 1e-12."""
@@ -897,7 +901,11 @@ def _growing(x: ExecutionGraph) -> PropertyVerdict:
 
 
 def _figures(figures: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {value:.6f}" for name, value in figures.items())
+    return ", ".join(f"{name} {_share(value)}" for name, value in figures.items())
+
+
+def _share(value: float, decimals: int = 6) -> str:
+    return f"{value:.{decimals}f}" if not 0 < value < RARE else f"{value:.6g}"
 
 
 def _why(error: Exception) -> str:
@@ -1038,6 +1046,8 @@ def _recovery_lines(found: Sequence[Recovery], odds: Odds) -> list[str]:
             lines += _recovery_row(f"  {r.name:{wide}}", r, odds)
     if odds.missing:
         return [*lines, f"  no probability: {odds.missing}"]
+    if never := [r.name for r in found if r.name not in odds.by_exit]:
+        lines.append(f"  no probability: by these numbers never taken: {', '.join(never)}")
     told = [text for text in odds.assumptions if not text.endswith(", not measured")]
     if len(told) < len(odds.assumptions):
         told.append("durations and shares as the task file declares them, where not measured")

@@ -271,7 +271,8 @@ class LearningSelector(FirstAlternative):
         """Remember the variables and the active runs, and record waits that ended."""
         self._values = state.variables
         for run in state.runs():
-            if run.phase is Phase.DONE:
+            # The stochastic view has the queue for a server itself.
+            if run.phase in (Phase.QUEUED, Phase.DONE):
                 continue
             active = self._run(now, run.id)
             if active.context is None and run.action:

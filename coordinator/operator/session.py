@@ -243,9 +243,11 @@ class RunSession(ABC):
         counted = session.save()
         learning, values = session.learning, session.selector.context
         for name, action, measure in learning.uncosted():
+            declared = learning.question(name).declared_cost(action)
             _log.warning(
-                "%s: no run of %s reported %s, so its cost was taken as 0; correct `cost` in the "
+                "%s: no run of %s reported %s, so its cost was taken as %s; correct `cost` in the "
                 "task file or the name in the action's result", name, action, measure,
+                "0" if math.isnan(declared) else f"{declared:g}, as the task file declares",
             )  # fmt: skip
         probabilities = {
             name: {action: round(p, 4) for action, p in selector.learned(values).items()}

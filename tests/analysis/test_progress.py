@@ -1520,6 +1520,8 @@ def test_without_an_estimate_there_is_no_probability() -> None:
     odds = judged(task).odds
     assert odds.missing == "no estimate for `recover`" and not odds.by_exit
     assert "no probability: no estimate for `recover`" in analyse(task).text()
+    sure = with_estimates(arm(1), {"move": (0.0, 1.0, 2.0), "recover": (0.1, 1.0, 2.0)})
+    assert "no probability: by these numbers never taken: " in analyse(sure).text()
 
 
 def test_the_same_task_gives_the_same_graph() -> None:

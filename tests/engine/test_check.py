@@ -361,6 +361,8 @@ def test_invariant_that_excludes_two_transitions(
             {"t": {"in": "x !lid", "out": "a"}, "u": {"in": "a:preempt=none lid", "out": "x lid"}},
         ),
         ("x=1 a! shut~=1 open~", DOOR),  # one of the two always bars
+        # a circle without tokens
+        ("x~ y~", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}}),
     ],
 )
 def test_a_loop_that_counts_or_bars_itself_is_no_timeless_cycle(

@@ -41,6 +41,8 @@ from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.table import TrialRow
 from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Executed, Status, Task
+from petrobot.coordinator.task.file import loads
+from petrobot.services.scripted import Scripted, ScriptedRun
 from tests.learning.cell import directory, run, scripts, sorting
 
 
@@ -381,3 +383,22 @@ async def test_the_operators_page_shows_the_state_of_learning(task: Task) -> Non
     assert shown["pick_slow"]["reliability"] == 1.0
     assert shown["pick_slow"] == {"action": "pick_slow", **selector.figures("pick")["pick_slow"]}
     await operation.close()
+
+
+def test_the_wait_for_a_server_is_no_part_of_a_run() -> None:
+    """Three tokens enter at once, and one of their runs of 2 s is active at a time. The stochastic
+    view has the queue itself."""
+    text = (
+        'schema = 1\n[task]\nname = "queue"\nfinal = "parts == 0"\n[primitive_tasks]\n'
+        'weigh = { deadline = 9.0 }\n[places]\nparts = { kind = "control", tokens = 3 }\n'
+        'weigh = { kind = "action", servers = 1 }\n[transitions]\n'
+        'put = { in = ["parts"], out = ["weigh"] }\n'
+        'weighed = { in = ["weigh:normal"] }\nlost = { in = ["weigh:error"] }\n'
+    )
+    queue = loads(text, "queue.toml")
+    selector = learner(queue, "fixed")
+    lines = {"weigh": Scripted([ScriptedRun(seconds=(2.0, 2.0))])}
+    cell, party = lockstep_cell(directory(queue), Setting(queue, selector=selector), lines)
+    assert cell.run(lambda: party.over, 400_000)
+    (tally,) = selector.learning.estimates.tallies.values()
+    assert tally.runs == 3 and tally.waited.high < 0.05

@@ -474,7 +474,7 @@ class Progress:
         if near:
             return f"when its tokens are there, it {' or '.join(sorted(set.union(*near)))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
-        return f"the tokens that it needs ({needs}) are never there together"
+        return f"in no state at rest are the tokens that it needs ({needs}) there together"
 
     def _never_true(self, t: CompiledTransition) -> str:
         """Return that its condition is false for all values that its variables ever have; empty if

@@ -30,7 +30,7 @@ __all__ = ["CheckReport", "Finding", "Severity", "check", "in_file"]
 def timeless_cycles(task: Task) -> Iterator[Finding]:
     """Find transitions that could fire for ever without time passing."""
     loose = endless(task)
-    if loose:
+    if loose & _reached(task, _ever_marked(task))[1]:
         text = f"{listed(loose)} can fire again and again without time passing"
         remedy = "let one of them wait for a run, an event or a time"
         yield Finding(Severity.ERROR, "timeless-cycle", f"transitions.{min(loose)}", text, remedy)
@@ -43,8 +43,7 @@ def never_marked(task: Task) -> Iterator[Finding]:
     for place in task.places.values():
         if place.kind is Kind.CONTROL and not place.tokens and place.name not in fed:
             yield _never_marked(Severity.NOTE, place.name, ", unless the operator adds one")
-    marked = {p.name for p in task.places.values() if p.tokens or p.kind is Kind.CONTROL}
-    marked, able = _reached(task, marked)
+    marked, able = _reached(task, _ever_marked(task))
     # A place that nothing feeds is a cause, and else a resource: in a circle of empty places, its
     # tokens are what was forgotten.
     order = sorted(
@@ -68,6 +67,11 @@ def never_marked(task: Task) -> Iterator[Finding]:
 def _never_marked(severity: Severity, place: str, more: str) -> Finding:
     text, remedy = f"it never holds a token{more}", "give it tokens or an arc from a transition"
     return Finding(severity, NEVER_MARKED, f"places.{place}", text, remedy)
+
+
+def _ever_marked(task: Task) -> set[str]:
+    """Return the places that have tokens at the beginning or may get some from the operator."""
+    return {p.name for p in task.places.values() if p.tokens or p.kind is Kind.CONTROL}
 
 
 def _reached(task: Task, marked: set[str]) -> tuple[set[str], set[str]]:
