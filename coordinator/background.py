@@ -159,16 +159,23 @@ class BackgroundProcess:
 
 
 def analysed(
-    text: str, filename: str, cell: Mapping[str, Any] | None = None, services: str = ""
+    text: str,
+    filename: str,
+    cell: Mapping[str, Any] | None = None,
+    services: str = "",
+    estimates: str = "",
 ) -> Iterator[dict[str, Any]]:
     """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`,
-    `services` is the path of its location file.
+    `services` is the path of its location file, `estimates` the folder of estimates files.
 
     Yield the verdicts, and all `findings` of `petrobot check`, first, then the same with the
     forecast, because that may take long. Raises TaskFileError.
     """
+    from dataclasses import replace
+
     from petrobot.coordinator.analysis.may_run import BUDGET, Cell, devices_of
     from petrobot.coordinator.analysis.report import analyse, with_forecast
+    from petrobot.coordinator.learning.propagation import newest_measured
     from petrobot.coordinator.operator.task_check import judge_text
     from petrobot.coordinator.task.file import loads
 
@@ -181,7 +188,11 @@ def analysed(
     if found is None:  # not searched because of other errors: here it was asked for
         found = analyse(task, limits=limits, steps=BUDGET.steps, devices=devices)
     yield _shown(found, known) | more
-    yield _shown(with_forecast(found, task, limits=limits, devices=devices), known) | more
+    measured, source = newest_measured(estimates, task, devices)
+    timed = with_forecast(found, task, measured=measured, limits=limits, devices=devices)
+    if source and timed.forecast is not None:
+        timed = replace(timed, notes=(*timed.notes, source))
+    yield _shown(timed, known) | more
 
 
 def _shown(analysis: Analysis, cell: Cell | None) -> dict[str, Any]:

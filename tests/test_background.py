@@ -25,6 +25,11 @@ from petrobot.coordinator.background import (
     Superseded,
     analysed,
 )
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
+from petrobot.coordinator.learning.estimates_file import EstimatesFile
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.page.task_work import export
+from petrobot.coordinator.task import Status
 from tests.waiting import until
 
 CATCH_BALL = (Path(background.__file__).parent / "tasks" / "catch_ball.toml").read_text(
@@ -81,6 +86,32 @@ def test_the_forecast_is_added_without_another_search(monkeypatch: pytest.Monkey
     second = next(answers)
     assert second["heat"] and not first["heat"]
     assert second["verdicts"] == first["verdicts"] and second["markings"] == first["markings"]
+
+
+def test_the_forecast_takes_the_newest_measured_numbers_and_names_their_file(
+    tmp_path: Path,
+) -> None:
+    for name, action, seconds in (("old", "locate_hough", 9.0), ("new", "locate_hough", 4.0)):
+        made = Estimates()
+        key = TallyKey("locate_ball", action, "")
+        made.tallies[key] = Tally().adding(Observation(Status.SUCCESS, seconds), "t")
+        EstimatesFile(tmp_path / f"{name}.db").add(made, {})
+    other = Estimates()
+    other.tallies[TallyKey("wash", "wash", "")] = Tally().adding(
+        Observation(Status.SUCCESS, 2.0), "t"
+    )
+    EstimatesFile(tmp_path / "of_another_task.db").add(other, {})
+    (tmp_path / "broken.db").write_text("not a database")
+    for age, name in enumerate(("broken", "of_another_task", "new", "old")):
+        os.utime(tmp_path / f"{name}.db", (1e9 - age, 1e9 - age))
+    *_, declared = analysed(CATCH_BALL, "catch_ball.toml")
+    *_, measured = analysed(CATCH_BALL, "catch_ball.toml", estimates=str(tmp_path))
+    assert f"numbers as measured in {tmp_path / 'new.db'}" in " ".join(measured["notes"])
+    assert "numbers as measured" not in " ".join(declared["notes"])
+    key = next(name for name in measured["figures"] if name.startswith("mean time"))
+    assert measured["figures"][key] > declared["figures"][key] + 3.0
+    drawn = export(CATCH_BALL, "catch_ball.toml", "gspn.svg", None, str(tmp_path)).text
+    assert "new.db" in drawn and "measured in 1 run" in drawn
 
 
 @pytest.mark.processes

@@ -134,6 +134,7 @@ async def _page(
             runs=runs,
             starts=station.form,
             services=station.directory.source,
+            estimates=options.estimates,
         )
     station.address = _addresses(station.directory, page)
     try:

@@ -9,9 +9,11 @@ conjunctive product R = R_1 R_2 ..., C = C_1 + C_2 + ..., which is computed as a
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from math import inf, isnan, log, nan, prod, sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
@@ -98,6 +101,23 @@ ChoiceShares = Mapping[str, Mapping[str, float]]
 
 
 # --- estimates into the stochastic view ---
+
+
+def newest_measured(
+    folder: str, task: Task, devices: Mapping[str, str] | None
+) -> tuple[Measured, str]:
+    """Return what the newest estimates file of a folder in which something of the task was measured
+    says, and where this is from in words; nothing and an empty text if there is none. Files that
+    cannot be read are left out."""
+    files = [file for file in Path(folder).glob("*.db") if file.is_file()] if folder else []
+    for file in sorted(files, key=lambda file: -file.stat().st_mtime):
+        with suppress(EstimatesError):
+            kept = EstimatesFile(file).read()
+            found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
+            if found.runs:
+                plant = f"plant {kept.plant or 'unknown'}"
+                return found, f"numbers as measured in {file} ({plant}), else as declared"
+    return Measured(), ""
 
 
 def measured_from(

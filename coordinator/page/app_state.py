@@ -38,6 +38,8 @@ class PageState:
     starts: StartForm | None = None
     services: str = ""
     """The path of the location file; empty if only `offers` are known."""
+    estimates: str = ""
+    """The folder of estimates files; empty if there is none."""
     limit: ConnectionLimit | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)

@@ -123,9 +123,9 @@ def load(text: str, filename: str) -> Task:
         raise FormatError(str(error)) from error
 
 
-def export(text: str, filename: str, form: str, cell: Fields) -> ConvertedTask:
-    """Return the task in another format; `gspn.svg` draws its stochastic view. Raises
-    FormatError."""
+def export(text: str, filename: str, form: str, cell: Fields, estimates: str = "") -> ConvertedTask:
+    """Return the task in another format; `gspn.svg` draws its stochastic view, with the numbers of
+    the newest estimates file in the folder `estimates`. Raises FormatError."""
     task = load(text, filename)
     if form == "toml":
         return ConvertedTask(dumps(task), "application/toml")
@@ -136,14 +136,18 @@ def export(text: str, filename: str, form: str, cell: Fields) -> ConvertedTask:
         return ConvertedTask(write_pnml(net_file_of(task)), "application/xml")
     if form == "gspn.svg":
         from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+        from petrobot.coordinator.learning.propagation import newest_measured
         from petrobot.coordinator.studies.report.gspn_picture import gspn_svg
 
         known = None if cell is None else Cell(**cell)
+        devices = devices_of(known)
         try:
-            view = stochastic_view(task, devices=devices_of(known))
+            measured, source = newest_measured(estimates, task, devices)
+            view = stochastic_view(task, measured, devices=devices)
         except ValueError as fault:
             raise FormatError(f"no stochastic view: {fault}") from fault
-        return ConvertedTask(gspn_svg(view, f"Assumed: {assumed(known)}."), "image/svg+xml")
+        legend = "; ".join(filter(None, (source, assumed(known))))
+        return ConvertedTask(gspn_svg(view, f"Assumed: {legend}."), "image/svg+xml")
     raise FormatError(f"no format {form!r}: toml, pnml and gspn.svg are known")
 
 
@@ -236,10 +240,12 @@ def _check(cell: Fields, services: str, name: str, **drawing: Any) -> dict[str, 
     return {"findings": findings(made["text"], f"{name}.toml", cell, services), **made}
 
 
-def _export(tasks: str, shipped: str, name: str, form: str, cell: Fields) -> dict[str, Any]:
+def _export(
+    tasks: str, shipped: str, name: str, form: str, cell: Fields, estimates: str
+) -> dict[str, Any]:
     try:
         task = _store(tasks, shipped).read(name)
-        made = export(task.text, f"{task.name}.toml", form, cell)
+        made = export(task.text, f"{task.name}.toml", form, cell, estimates)
     except StoreError as fault:
         raise _refused(fault) from fault
     except FormatError as fault:

@@ -17,6 +17,9 @@ import pytest_asyncio
 from petrobot.coordinator.analysis.formats import pnml
 from petrobot.coordinator.analysis.formats.pnml import parse_pnml
 from petrobot.coordinator.cli.loading import own_tasks
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
+from petrobot.coordinator.learning.estimates_file import EstimatesFile
+from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.operator import history as journals
 from petrobot.coordinator.page import edits
 from petrobot.coordinator.page import task_store as store
@@ -24,6 +27,7 @@ from petrobot.coordinator.page import task_work as verdicts
 from petrobot.coordinator.page.access import HEADERS
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.page.task_work import as_task_file
+from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load, loads
 from petrobot.services.comm import location_file
 from tests.page.stage import Stage
@@ -221,6 +225,28 @@ async def test_the_stochastic_view_is_drawn(http: aiohttp.ClientSession, tasks: 
     assert "Assumed: two runs never use one device at a time" in drawn
     async with http.get(f"/api/tasks/{TASK}/export/gspn.svg") as answer:
         assert answer.status == 400 and "no stochastic view: " in await answer.text()
+
+
+async def test_forecasts_take_what_was_learned(stage: Stage, tasks: Path, tmp_path: Path) -> None:
+    """The drawing and the analysis name the estimates file that their numbers come from."""
+    text = (ROOT / "coordinator" / "tasks" / "catch_ball.toml").read_text(encoding="utf-8")
+    (tasks / "catch_ball.toml").write_text(text, encoding="utf-8")
+    made = Estimates()
+    key = TallyKey("locate_ball", "locate_hough", "")
+    made.tallies[key] = Tally().adding(Observation(Status.SUCCESS, 4.0), "t")
+    EstimatesFile(tmp_path / "learned.db").add(made, {})
+    page = await start_page(stage, tasks_folder=tasks, estimates=tmp_path)
+    headers = {"Authorization": f"Bearer {page.token}"}
+    try:
+        async with aiohttp.ClientSession(page.base, headers=headers) as http:
+            async with http.get("/api/tasks/catch_ball/export/gspn.svg") as answer:
+                assert "learned.db" in await answer.text()
+            document = (await opened(http, "catch_ball"))["document"]
+            asked = {"name": "catch_ball", "document": document}
+            async with http.post("/api/analyse", json=asked) as answer:
+                assert "learned.db" in " ".join((await answer.json())["notes"])
+    finally:
+        await page.close()
 
 
 async def test_pnml_is_exported_and_imported(http: aiohttp.ClientSession, tasks: Path) -> None:
