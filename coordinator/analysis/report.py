@@ -776,7 +776,7 @@ def _forecast(
 LEAST_SHARE = 5e-4
 """Least share of the time from which an action is worth improving: less is printed as 0.0 %."""
 RARE = 1e-3
-"""Shares below it are told with six digits, for six decimals would hide them."""
+"""Shares below it are printed with six digits: six decimals would hide them."""
 AGREE = 1e-6
 """Relative difference up to which a figure of two models counts as the same: both are solved to
 about 1e-12."""

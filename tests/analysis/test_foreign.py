@@ -512,8 +512,8 @@ def test_large_numbers_of_tina(tmp_path: Path) -> None:
         ("tr t a -> b\ntr a a -> b\n", "net.net:2: a: this id occurs twice"),
         ("|0|\n|\n", "net.net:1: line: a line that begins with '|0|'; a net of TINA"),
         ("tr t a -> b\npl {p\xe9}\n", "net.net:2: file: 'utf-8' codec"),
-        ("tr t [0,w[ [1,2] a -> b\n", "net.net:1: line: '[1,2]' is no name"),
-        ("tr <t> a -> b\n", "net.net:1: line: '<t>' is no name"),
+        ("tr t [0,w[ [1,2] a -> b\n", "net.net:1: line: '[1,2]' is not a name"),
+        ("tr <t> a -> b\n", "net.net:1: line: '<t>' is not a name"),
     ],
 )
 def test_faults_of_a_tina_file_have_a_line(tmp_path: Path, text: str, said: str) -> None:

@@ -275,7 +275,7 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
         )
     (net,) = nets
     kind = (net.get("type") or "").strip().lower()
-    if kind and not re.fullmatch(PLACE_TRANSITION, kind):
+    if kind and not PLACE_TRANSITION.fullmatch(kind):
         raise NetFileError(
             file,
             f"net {net.get('id')}",

@@ -131,7 +131,7 @@ class _TinaReading:
         """Return the name that a word gives to a node. Raises NetFileError."""
         name = _bare(word)
         if name == word and not BARE.fullmatch(word):
-            problem = f"{word!r} is no name"
+            problem = f"{word!r} is not a name"
             raise self.draft.fault("line", problem, "write a name with other signs in braces")
         return name
 
