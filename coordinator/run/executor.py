@@ -232,8 +232,8 @@ class Executor:
             self._queue.extend(self.dispatch.carry_out(now, instruction))
 
     def _safe_effects(self, now: float) -> list[Instruction]:
-        """Store records, and return the effects that may leave: after a sync if an effect moves
-        hardware or ends the mission run, otherwise when the records survive this process.
+        """Return the effects that may leave: after a sync if an effect moves hardware or ends the
+        mission run; other orders when their records survive this process.
 
         Effects of one turn share one sync, and while it is under way others gather for the next.
         What waits is synced within `SYNC_WITHIN`, and acknowledged then.
@@ -249,7 +249,6 @@ class Executor:
                 or any(self._needs_sync(effect) for effect in effects)
             ):
                 return self._sync(now, effects)
-        self.store.flush()
         if self._unsafe_since is None and not self.store.safe:
             self._unsafe_since = now
         leaving, self._effects = self._split(effects)
@@ -260,13 +259,12 @@ class Executor:
         self._unsafe_since, self._sync_wanted = None, False
         then, self._when_safe = self._when_safe, []
         if not self.store.safe:
-            sync = self.store.begin_sync()
             if self.in_background is not None:
                 leaving, waiting = self._split(effects)
                 self._syncing = waiting, then
-                self.in_background(sync)
+                self.in_background(self.store.sync)
                 return leaving
-            sync()
+            self.store.sync()
         for call in then:
             call(now)
         return effects
@@ -278,12 +276,14 @@ class Executor:
 
     def _split(self, effects: Iterable[Instruction]) -> tuple[list[Instruction], list[Instruction]]:
         """Return the effects that may leave without a sync, and those that wait for one: orders to
-        a device, and any behind another order about the same run."""
+        a device, any behind another order about the same run, and all while a sync is writing."""
         before = [] if self._syncing is None else self._syncing[0]
         runs = {effect.run for effect in before if isinstance(effect, _Order)}
         leaving, waiting = list[Instruction](), list[Instruction]()
         for effect in effects:
-            if isinstance(effect, _Order) and (effect.run in runs or self._needs_sync(effect)):
+            if isinstance(effect, _Order) and (
+                effect.run in runs or self._needs_sync(effect) or not self.store.flush()
+            ):
                 runs.add(effect.run)
                 waiting.append(effect)
             else:

@@ -3,7 +3,7 @@ each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from petrobot.coordinator.engine import Instruction, State, Stimulus
@@ -36,16 +36,17 @@ class Store(Protocol):
         """Store a record that is no stimulus, with the next sync
         (`coordinator/run/recording.py` has the kinds)."""
 
-    def flush(self) -> None:
-        """Make all that was appended survive the end of this process."""
+    def flush(self) -> bool:
+        """Make all that was appended survive the end of this process. Return False, without
+        waiting, while a sync in another thread is writing."""
 
-    def begin_sync(self) -> Callable[[], None]:
-        """Return what makes all durable that has been appended: it may take seconds, and may be
-        done in another thread."""
+    def sync(self) -> None:
+        """Make all durable that has been appended: it may take seconds, and may be done in another
+        thread."""
 
     @property
     def stood(self) -> float:
-        """Longest time that a write took (s): whoever appends stands still meanwhile."""
+        """Longest time that `flush` took (s): the coordinator stands still meanwhile."""
 
     @property
     def safe(self) -> bool:
@@ -88,12 +89,12 @@ class Forgetful:
     def record(self, kind: str, data: Mapping[str, Any]) -> None:
         """Keep nothing."""
 
-    def flush(self) -> None:
+    def flush(self) -> bool:
         """Nothing to flush."""
+        return True
 
-    def begin_sync(self) -> Callable[[], None]:
+    def sync(self) -> None:
         """Nothing to make safe."""
-        return lambda: None
 
 
 class FirstAlternative:

@@ -22,9 +22,9 @@ import re
 import struct
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -70,22 +70,25 @@ class Journal:
 
 class JournalWriter:
     """Appends records; `sync` makes all that was appended durable with one fdatasync (group
-    commit)."""
+    commit). A disk may need seconds for that, so `sync` may run in another thread meanwhile."""
 
     def __init__(self, path: Path, header: Mapping[str, Any] | None = None) -> None:
         """Create a journal with a header or, without one, continue an existing file after its last
         good record."""
         self.path = path
         self._at = path.absolute()  # an action in this process may change the working directory
+        self._appended = deque[bytes]()
+        """Records that no thread has begun to write."""
         self._buffer = bytearray()
+        """What `_write` has to write; `_writing` is its lock."""
         self._written = self._durable = 0
         """How many times records were written to the file, and how many of these are durable."""
         self._torn: int | None = None
         """Where to cut the file before anything is appended; None: nowhere."""
-        self._syncing = Lock()
+        self._writing, self._syncing = Lock(), Lock()
         self.syncs = 0
         self.stood = 0.0
-        """Longest time that a write took (s)."""
+        """Longest time that `flush` took (s)."""
         if header is not None:
             try:
                 make_folder(path.parent)
@@ -102,7 +105,7 @@ class JournalWriter:
                 raise JournalError(text) from fault
             self._take(path)
             date_back(path.parent.parent)
-            self._buffer += MAGIC
+            self._appended.append(MAGIC)
             self.next_number = 0
             self.append("header", {"format": FORMAT, **header})
             try:
@@ -156,14 +159,14 @@ class JournalWriter:
             raise JournalError(
                 f"{self.path}: a record of {len(payload)} bytes is larger than {LARGEST_RECORD}"
             )
-        self._buffer += PREFIX.pack(len(payload), zlib.crc32(payload)) + payload
+        self._appended.append(PREFIX.pack(len(payload), zlib.crc32(payload)) + payload)
         self.next_number += 1
         return number
 
     def cut(self, number: int) -> None:
         """Drop a record and all after it when the next ones are written. Nothing may wait to be
         written."""
-        assert not self._buffer
+        assert not self.unsaved
         raw, offset = self.path.read_bytes(), len(MAGIC)
         for _ in range(number):
             payload = _payload(raw, offset)
@@ -174,20 +177,48 @@ class JournalWriter:
     @property
     def pending(self) -> bool:
         """Whether records wait for the next sync."""
-        return bool(self._buffer) or self._durable < self._written
+        return self.unsaved or self._durable < self._written
 
     @property
     def unsaved(self) -> bool:
         """Whether records would be lost with this process."""
-        return bool(self._buffer)
+        return bool(self._appended or self._buffer)
 
-    def flush(self) -> None:
+    def flush(self) -> bool:
         """Write what was appended to the file: it survives the end of this process, but not a power
-        cut. Raises JournalError, also if the file is no longer where a resume would look for it."""
-        if not self._buffer:
-            return
-        self._written += 1
+        cut. Returns False, without waiting, while another thread writes. Raises JournalError, also
+        if the file is no longer where a resume would look for it."""
+        if not self._writing.acquire(blocking=False):
+            return False
         began = time.monotonic()
+        try:
+            self._write()
+        finally:
+            self._writing.release()
+            self.stood = max(self.stood, time.monotonic() - began)
+        return True
+
+    def sync(self) -> None:
+        """Make all that was appended durable; does nothing if it already is. Raises as `flush`."""
+        with self._syncing:
+            with self._writing:
+                self._write()
+                written = self._written
+            if self._durable == written:
+                return
+            try:
+                os.fdatasync(self._file)
+            except OSError as fault:
+                raise self._refused(fault) from fault
+            self.syncs += 1
+            self._durable = written
+
+    def _write(self) -> None:
+        if not self.unsaved:
+            return
+        self._written += 1  # before the records are taken: `pending` holds in every thread
+        while self._appended:
+            self._buffer += self._appended.popleft()
         try:
             if self._torn is not None:
                 os.ftruncate(self._file, self._torn)
@@ -199,11 +230,7 @@ class JournalWriter:
         except FileNotFoundError:
             kept = False
         except OSError as fault:
-            raise JournalError(
-                f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
-            ) from fault
-        finally:
-            self.stood = max(self.stood, time.monotonic() - began)
+            raise self._refused(fault) from fault
         if not kept:
             # The open file has lost its name, so no resume would ever find what is written to it.
             raise JournalError(
@@ -211,27 +238,10 @@ class JournalWriter:
                 "sent on the strength of its last records; put it back"
             )
 
-    def sync(self) -> None:
-        """Make all that was appended durable; does nothing if it already is."""
-        self.begin_sync()()
-
-    def begin_sync(self) -> Callable[[], None]:
-        """Write what was appended, and return what makes it durable: that may take seconds, and may
-        be done in another thread. Both raise JournalError."""
-        self.flush()
-        return partial(self._sync, self._written)
-
-    def _sync(self, written: int) -> None:
-        with self._syncing:
-            if self._durable < written:
-                try:
-                    os.fdatasync(self._file)
-                except OSError as fault:
-                    raise JournalError(
-                        f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
-                    ) from fault
-                self.syncs += 1
-                self._durable = max(self._durable, written)
+    def _refused(self, fault: OSError) -> JournalError:
+        return JournalError(
+            f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
+        )
 
     def close(self) -> None:
         """Sync and close; the file is closed even if the sync fails. If the disk does not answer

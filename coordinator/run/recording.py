@@ -13,7 +13,7 @@ import math
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -144,17 +144,17 @@ class JournalStore:
         self.record(REMARK, {"t": remark.time, "author": author, "text": remark.text})
         return remark
 
-    def flush(self) -> None:
-        """Make all that was appended survive the end of this process."""
-        self.writer.flush()
+    def flush(self) -> bool:
+        """Make all that was appended survive the end of this process; False: a sync is writing."""
+        return self.writer.flush()
 
-    def begin_sync(self) -> Callable[[], None]:
-        """Return what makes all durable that has been appended."""
-        return self.writer.begin_sync()
+    def sync(self) -> None:
+        """Make all durable that has been appended."""
+        self.writer.sync()
 
     @property
     def stood(self) -> float:
-        """Longest time that a write took (s): whoever appends stands still meanwhile."""
+        """Longest time that `flush` took (s)."""
         return self.writer.stood
 
     @property

@@ -75,23 +75,18 @@ class MortalStore(JournalStore):
         if kind == STAGE:
             self.count()
 
-    def flush(self) -> None:
+    def flush(self) -> bool:
         """Flush, and count it."""
-        unsaved = self.writer.unsaved
-        super().flush()
-        if unsaved:
+        unsaved, done = self.writer.unsaved, super().flush()
+        if unsaved and done:
             self.count()
+        return done
 
-    def begin_sync(self) -> Callable[[], None]:
+    def sync(self) -> None:
         """Write, and count it and its sync."""
         self.flush()
-        work = super().begin_sync()
-
-        def sync() -> None:
-            work()
-            self.count()
-
-        return sync
+        super().sync()
+        self.count()
 
 
 def counting(directory: Directory, log: Path) -> dict[str, Callable[..., Any]]:

@@ -375,21 +375,25 @@ def test_after_a_sync_that_was_asked_for_none_is_due(tmp_path: Path) -> None:
 
 
 class SlowDisk:
-    """A bench that has begun; its disk writes when the test says so."""
+    """A bench that has begun; a sync of its disk ends when the test says so."""
 
     def __init__(self, folder: Path) -> None:
         self.bench = Bench(store=JournalStore(JournalWriter(folder / "run.journal", {}), 0.0))
-        self._syncs: list[Callable[[], None]] = []
-        self.bench.executor.in_background = self._syncs.append
+        self._syncing = False
+        self.bench.executor.in_background = self._sync
         self.bench.link(0.0)
         self.bench.sent()
         self.bench.executor.stimulate(0.0, Begin())
 
+    def _sync(self, work: Callable[[], None]) -> None:
+        assert not self._syncing
+        self._syncing = True
+        work()  # what is appended from now on needs another one
+
     def writes(self, now: float) -> list[Message]:
         """End the sync, and return what leaves then."""
-        (sync,) = self._syncs
-        self._syncs.clear()
-        sync()
+        assert self._syncing
+        self._syncing = False
         self.bench.executor.synced(now)
         return self.bench.sent(m.Call, m.Cancel, m.Command, m.EventAck, m.ResultAck)
 
@@ -439,6 +443,35 @@ def test_only_what_moves_hardware_waits_for_a_slow_disk(tmp_path: Path) -> None:
     assert len(syncs) == 1, "what has waited for half a second is synced"
     bench.say(0.7, done(WORK))
     assert bench.calls() == [TIDY], "also meanwhile"
+
+
+def test_an_order_without_a_device_waits_while_a_hung_disk_writes(tmp_path: Path) -> None:
+    """The coordinator must not wait for the disk itself: nodes would count as lost."""
+    writer = JournalWriter(tmp_path / "run.journal", {})
+    bench = Bench(store=JournalStore(writer, 0.0), device='node = "motion"')
+    syncs: list[Callable[[], None]] = []
+    bench.executor.in_background = syncs.append
+    bench.link(0.0)
+    with writer._writing:  # held by the sync
+        bench.executor.stimulate(0.0, Begin())
+        bench.go(0.6)
+        assert bench.calls() == [] and len(syncs) == 1
+    syncs[0]()
+    bench.executor.synced(0.7)
+    assert bench.calls() == [WORK]
+
+
+def test_what_leads_to_no_order_is_written_with_the_next_sync(tmp_path: Path) -> None:
+    """Each write may meet a hung disk. Its node keeps what is not acknowledged."""
+    writer = JournalWriter(tmp_path / "run.journal", {})
+    bench = Bench(store=JournalStore(writer, 0.0), device='node = "motion"')
+    bench.link(0.0)
+    bench.executor.stimulate(0.0, Begin())
+    assert (bench.calls(), writer.unsaved) == ([WORK], False)
+    bench.say(0.1, m.Accept(WORK))
+    assert (writer.unsaved, writer.pending) == (True, True)
+    bench.go(0.6)
+    assert (writer.unsaved, writer.pending) == (False, False)
 
 
 # --- arguments that no message carries --------------------------------------------------------

@@ -233,11 +233,10 @@ def test_with_a_full_disk_nothing_is_sent_that_is_not_recorded(
     with pytest.raises(JournalError, match="No space left"):
         bench.say(1.0, m.Outcome(WORK, "success"))
     assert bench.sent(m.Call, m.ResultAck) == []
+    bench.executor.stimulate(1.1, Begin())  # leads to no order, so it is written later
     with pytest.raises(JournalError):
-        bench.executor.stimulate(1.1, Begin())
+        bench.go(1.7)
     assert bench.sent(m.Call, m.ResultAck) == []
     journal = read_journal(tmp_path / "run.journal")
-    assert [r.data["stimulus"]["kind"] for r in journal.records if r.kind == "stimulus"] == [
-        "Begin",
-        "RunStarted",
-    ]
+    stimuli = [r.data["stimulus"]["kind"] for r in journal.records if r.kind == "stimulus"]
+    assert stimuli == ["Begin"], "the run's start led to no order"

@@ -79,20 +79,16 @@ class MortalStore(JournalStore):
         self._count()
         super().append(now, stimulus, instructions, state)
 
-    def flush(self) -> None:
+    def flush(self) -> bool:
         self._count()
-        super().flush()
+        done = super().flush()
         self._count()
+        return done
 
-    def begin_sync(self) -> Callable[[], None]:
+    def sync(self) -> None:
+        self.flush()
+        super().sync()
         self._count()
-        work = super().begin_sync()
-
-        def sync() -> None:
-            work()
-            self._count()
-
-        return sync
 
 
 class Laboratory:
