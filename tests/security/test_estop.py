@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -39,10 +39,10 @@ from tests.in_loop import NodeInLoop
 from tests.node.test_processes import Nodes, operator_of, pids
 from tests.ports import free_ports
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
+from tests.security.conftest import Said
 from tests.waiting import Limit, beat, until
 
 pytestmark = pytest.mark.processes
-Said = Callable[..., Awaitable[tuple[int, str, str]]]
 LIMIT = 60.0
 RAMP = 1.0
 """Seconds after which a drive's quick stop and braking have ended."""
@@ -64,18 +64,6 @@ async def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     """Return its exit code and output."""
     out, err = await asyncio.to_thread(process.communicate, None, LIMIT)
     return process.returncode, out, err
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Said:
-    """Give a command in this process, and return its exit code and output."""
-
-    async def give(*arguments: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = await asyncio.to_thread(main, list(arguments))
-        return code, *capsys.readouterr()
-
-    return give
 
 
 class Cell:
