@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine import Instruction, Report
 from petrobot.coordinator.launch import Setting, lockstep_mission, lockstep_party
@@ -34,35 +35,21 @@ port = 7305
 """
 
 
-def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> dict[str, Any]:
-    """Run one throw; return the result without its wall-clock time."""
+def run(services: Path, *arguments: str, process: bool = False, seed: int = 5) -> dict[str, Any]:
+    """Run one throw, in a new process or in this one; return the result without its wall-clock
+    time."""
     path = services.parent / "out.json"
-    given = [
-        "--services",
-        str(services),
-        "--mode",
-        "lockstep",
-        "--runs",
-        "1",
-        "--seed",
-        str(seed),
-        "--regime",
-        regime,
-    ]
-    command = [
-        sys.executable,
-        "-m",
-        "petrobot.coordinator",
-        "run",
-        "catch_ball",
-        *given,
-        "--json",
-        str(path),
-        "--quiet",
-        *arguments,
-    ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    given = f"--mode lockstep --runs 1 --seed {seed} --regime B --quiet".split()
+    command = ["run", "catch_ball", "--services", str(services), "--json", str(path), *given]
+    command += arguments
+    if process:
+        python = [sys.executable, "-m", "petrobot.coordinator"]
+        done = subprocess.run(
+            [*python, *command], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+    else:
+        assert main(command) == 0
     result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     del result["wall_s"]
     return result
@@ -73,7 +60,8 @@ def usual(shared: Callable[..., Path]) -> dict[str, Any]:
     """Return the result of the shipped placement in one process."""
 
     def make(folder: Path) -> None:
-        (folder / "usual.json").write_text(json.dumps(run(services_file(folder))), "utf-8")
+        result = run(services_file(folder), process=True)
+        (folder / "usual.json").write_text(json.dumps(result), "utf-8")
 
     folder = shared("lockstep-cell", make)
     result: dict[str, Any] = json.loads((folder / "usual.json").read_text("utf-8"))
@@ -100,7 +88,8 @@ def test_a_process_per_node_and_a_third_node_change_nothing(
         '[timers.image_tick]\nnode = "vision"': '[timers.image_tick]\nnode = "desk"',
         '[services.memory]\nnode = "vision"': '[services.memory]\nnode = "desk"',
     }
-    assert run(services_file(tmp_path, edits=edits, more=DESK), "--processes", "0") == usual
+    services = services_file(tmp_path, edits=edits, more=DESK)
+    assert run(services, "--processes", "0", process=True) == usual
 
 
 def test_moving_the_camera_and_its_actions_changes_nothing(

@@ -10,13 +10,14 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from petrobot.coordinator.cli import main
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.protocol import messages as m
@@ -27,6 +28,7 @@ from petrobot.services.comm.tls.credentials import Credentials
 from tests.comm.ends import framed
 from tests.waiting import Limit, beat
 
+Said = Callable[..., Awaitable[tuple[int, str, str]]]
 KEY = bytes(range(32))
 HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 3)
 SCRIPT = Path(__file__).with_name("server_process.py")
@@ -256,3 +258,15 @@ def many_files() -> Iterator[None]:
     )
     yield
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Said:
+    """Give a command in this process, and return its exit code and output."""
+
+    async def give(*arguments: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = await asyncio.to_thread(main, list(arguments))
+        return code, *capsys.readouterr()
+
+    return give

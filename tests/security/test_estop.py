@@ -31,9 +31,15 @@ from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory, load
+from petrobot.services.device import Driver
+from petrobot.services.host.emergency_latch import latch_of
+from petrobot.services.node.inline_host import InlineHost
+from petrobot.services.node.node import Node
+from tests.in_loop import NodeInLoop
 from tests.node.test_processes import Nodes, operator_of, pids
 from tests.ports import free_ports
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
+from tests.security.conftest import Said
 from tests.waiting import Limit, beat, until
 
 pytestmark = pytest.mark.processes
@@ -71,6 +77,7 @@ class Cell:
         self.supervisor = supervisor
         self.ear = ear
         self.runs = folder / "runs"
+        self._cell = ["--services", str(directory.source), "--journal", str(self.runs)]
         self.coordinator: subprocess.Popen[str] | None = None
 
     async def heard(self, holds: Callable[[Ear], bool]) -> None:
@@ -86,17 +93,20 @@ class Cell:
 
     def task(self, **variables: str) -> subprocess.Popen[str]:
         """Start a coordinator that would move the arm."""
-        services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
         task = str(self.folder / "sweeping.toml")
-        return petrobot("run", task, "--runs", "3", *services, "--no-page", "--quiet", **variables)
+        options = [*self._cell, "--no-page", "--quiet"]
+        return petrobot("run", task, "--runs", "3", *options, **variables)
 
     async def estop(self, *options: str) -> tuple[int, Any]:
         """Give `petrobot estop`; return its exit code and answers. It is a process, as for the
         operator: here it would share the interpreter with the listener on the bus."""
-        services = ["--services", str(self.directory.source), "--journal", str(self.runs)]
-        code, out, err = await finished(petrobot("estop", *services, "--json", "-", *options))
+        code, out, err = await finished(petrobot("estop", *self._cell, "--json", "-", *options))
         assert out, err
         return code, json.loads(out)
+
+    async def clear(self) -> int:
+        """Clear the stop, and return the exit code."""
+        return await asyncio.to_thread(main, ["estop", "--clear", *self._cell])
 
     async def standing(self) -> None:
         """Wait until the joints have not moved during the time of a braking ramp."""
@@ -155,7 +165,7 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
         code, _, _ = await finished(cell.coordinator)
         assert code == 1, "the task's own recovery must not have moved the arm"
         assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED)
-        assert (await cell.estop("--clear"))[0] == 0
+        assert await cell.clear() == 0
         assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED), (
             "clearing alone moves and enables nothing"
         )
@@ -166,7 +176,7 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
         await cell.heard(Ear.stopped_by_nmt)
         assert told["coordinator"].endswith(("aborted", "has ended"))
         assert (await finished(cell.coordinator))[0] == 1
-        assert (await cell.estop("--clear"))[0] == 0
+        assert await cell.clear() == 0
         await cell.sweep()  # bus and drives are configured again
 
 
@@ -214,7 +224,7 @@ async def test_a_stop_remains_after_its_node_is_killed(tmp_path: Path, answers: 
         assert mission.executor.finished is not None
         assert mission.executor.finished.reason == "aborted: emergency stop, as motion reports"
         assert without_power(cell.ear) and cell.ear.energised == 0, "not even for a moment"
-        assert (await cell.estop("--clear"))[0] == 0
+        assert await cell.clear() == 0
         await cell.sweep()
 
 
@@ -272,16 +282,16 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("keys", ['file = "cell.key"', 'certificates = "keys"'])
 async def test_a_key_that_cannot_be_used_does_not_keep_a_stop_from_bus_and_latch(
-    tmp_path: Path, keys: str
+    tmp_path: Path, keys: str, said: Said
 ) -> None:
     """A wrong copy of a key, in the middle of its replacement, must not disarm the stop."""
     source = cell_in(tmp_path).source
     source.write_text(f"{source.read_text()}\n[keys]\n{keys}\n")
     services = ["--services", str(source), "--journal", str(tmp_path)]
-    code, out, said = await finished(petrobot("estop", *services))
-    assert code == 3 and "NO ANSWER: " in out and "No such file" in out, said
+    code, out, err = await said("estop", *services)
+    assert code == 3 and "NO ANSWER: " in out and "No such file" in out, err
     assert "no CAN hub" in out and "latched" in out
-    code, out, _ = await finished(petrobot("estop", "--clear", *services))
+    code, out, _ = await said("estop", "--clear", *services)
     assert code == 0 and "No such file" in out and "; its stop is cleared on disk" in out
 
 
@@ -337,19 +347,18 @@ def test_a_busy_host_is_no_disk_that_hangs(monkeypatch: pytest.MonkeyPatch) -> N
     never.set()
 
 
-async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
+async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path, said: Said) -> None:
     """If the nodes end with the run, the stop could not be cleared otherwise: exit code 0, and the
     file is removed."""
     directory = cell_in(tmp_path)
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
-    code, out, _ = await finished(petrobot("estop", *services))
+    code, out, _ = await said("estop", *services)
     assert code == 3 and "latched" in out and still_stopped(directory) == ["motion"]
-    code, out, _ = await finished(petrobot("estop", "--clear", *services))
+    code, out, _ = await said("estop", "--clear", *services)
     assert code == 0 and "cleared on disk" in out and "NO ANSWER" not in out
     assert still_stopped(directory) == []
-    assert (await finished(petrobot("estop", "--clear", *services)))[0] == 3, (
-        "nobody there, and nothing to clear"
-    )
+    code, *_ = await said("estop", "--clear", *services)
+    assert code == 3, "nobody there, and nothing to clear"
 
 
 ONE_NODE = """schema = 1
@@ -360,6 +369,21 @@ port = {}
 node = "pc"
 driver = "petrobot:Driver"
 """
+
+
+@asynccontextmanager
+async def node_of(cell: Path) -> AsyncIterator[None]:
+    """Run the node of a location file in this loop, with its latch on disk."""
+    directory, clock = load(cell), asyncio.get_running_loop().time
+    axis = InlineHost({}, clock=clock, driver=Driver({}, None))
+    latch = latch_of(cell, "pc")
+    node = Node(directory, "pc", boot="b1", clock=clock, places={"axis": axis}, latch=latch)
+    running = NodeInLoop(node, directory.address("pc"))
+    await running.start()
+    try:
+        yield
+    finally:
+        await running.close()
 
 
 def renamed(cell: Path) -> None:
@@ -378,17 +402,13 @@ def renamed(cell: Path) -> None:
 )
 @pytest.mark.parametrize("killed", [False, True])
 async def test_a_file_that_was_edited_in_mid_run_does_not_keep_a_stop_from_its_nodes(
-    tmp_path: Path, edit: Callable[[Path], Any], code: int, killed: bool
+    tmp_path: Path, edit: Callable[[Path], Any], code: int, killed: bool, said: Said
 ) -> None:
     """A slip of the editor disarmed the stop, and a node that had another name meanwhile was not
     stopped, later only if the coordinator was `killed`. The stop is cleared where it was stored."""
     cell = tmp_path / "services.toml"
     cell.write_text(ONE_NODE.format(*free_ports(1)))
-    node = petrobot("node", "pc", "--services", str(cell))
-    try:
-        assert node.stdout is not None
-        ready = asyncio.to_thread(node.stdout.readline)
-        assert "ready" in await asyncio.wait_for(ready, LIMIT)
+    async with node_of(cell):
         then = header("run", "", cell.read_text(), "realtime", {"services_path": str(cell)})
         JournalWriter(tmp_path / "runs" / "run" / "run.journal", then).close()
         edit(cell)
@@ -396,20 +416,17 @@ async def test_a_file_that_was_edited_in_mid_run_does_not_keep_a_stop_from_its_n
         journal = ["--journal", str(tmp_path / "runs")]
         services = ["--services", str(cell), *journal]
         if killed:
-            said = await finished(petrobot("estop", *services))
+            found = await said("estop", *services)
         else:
             with published(tmp_path / "runs" / "run", address):
-                said = await finished(petrobot("estop", *journal))
-        assert said[0] == code and re.search("^pc +axis +stopped$", said[1], re.M), said
-        said = await finished(petrobot("estop", "--clear", *services))
-        assert said[0] == 0 and re.search("^pc +axis +cleared$", said[1], re.M), said
-    finally:
-        node.terminate()
-        await finished(node)
+                found = await said("estop", *journal)
+        assert found[0] == code and re.search("^pc +axis +stopped$", found[1], re.M), found
+        found = await said("estop", "--clear", *services)
+        assert found[0] == 0 and re.search("^pc +axis +cleared$", found[1], re.M), found
 
 
 async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_cleared(
-    tmp_path: Path,
+    tmp_path: Path, said: Said
 ) -> None:
     """The copy of the caller said for ever that the node was stopped, with a remedy that did
     nothing."""
@@ -419,19 +436,12 @@ async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_
         (tmp_path / name / "services.toml").write_text(cell)
     directory = load(tmp_path / "here" / "services.toml")
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
-    code, out, _ = await finished(petrobot("estop", *services))
+    code, out, _ = await said("estop", *services)
     assert code == 3 and "latched" in out and still_stopped(directory) == ["pc"]
-    node = petrobot("node", "pc", "--services", str(tmp_path / "there" / "services.toml"))
-    try:
-        assert node.stdout is not None
-        ready = asyncio.to_thread(node.stdout.readline)
-        assert "ready" in await asyncio.wait_for(ready, LIMIT)
-        code, out, err = await finished(petrobot("estop", "--clear", *services))
+    async with node_of(tmp_path / "there" / "services.toml"):
+        code, out, err = await said("estop", "--clear", *services)
         assert code == 0 and "cleared" in out, (out, err)
         assert still_stopped(directory) == []
-    finally:
-        node.terminate()
-        await finished(node)
 
 
 async def test_estop_says_that_a_stop_cannot_be_cleared(

@@ -167,7 +167,10 @@ async def test_on_its_own_host_it_is_in_reach(victim: Start) -> None:
 class Guarded:
     """The arm's cell with a key or certificates, and all its output and files."""
 
-    def __init__(self, folder: Path, how: str) -> None:
+    def __init__(
+        self, folder: Path, how: str, capsys: pytest.CaptureFixture[str] | None = None
+    ) -> None:
+        """`capsys` is for `give`."""
         directory = cell_in(folder, speed=1.0)
         if how == "certificates":
             make_certificates(folder / "keys", ["coordinator", *directory.nodes])
@@ -176,6 +179,7 @@ class Guarded:
         text = directory.source.read_text() + (CERTIFICATES if how == "certificates" else SHARED)
         directory.source.write_text(text)
         self.folder = folder
+        self._capsys = capsys
         self.directory = parse(text, directory.source)
         self.said: list[str] = []
 
@@ -192,18 +196,23 @@ class Guarded:
         return found
 
     def petrobot(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run a command and keep its output."""
-        services = (
-            ["--services", str(self.directory.source)]
-            if arguments[0] in ("run", "nodes", "estop")
-            else []
-        )
+        """Run a command as a process and keep its output."""
+        services = ["--services", str(self.directory.source)]
         done = run("petrobot.coordinator", *arguments, *services, cwd=self.folder)
         self.said += [done.stdout, done.stderr]
         return done
 
-    def with_strange_keys(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run the same command with other keys."""
+    async def give(self, *arguments: str) -> tuple[int, str]:
+        """Run a command in this process and keep its output; return its exit code and its
+        errors."""
+        assert self._capsys is not None
+        code = await asyncio.to_thread(main, list(arguments))
+        said = self._capsys.readouterr()
+        self.said += [said.out, said.err]
+        return code, said.err
+
+    async def with_strange_keys(self, *arguments: str) -> tuple[int, str]:
+        """Run a command with other keys."""
         own = [*self.folder.glob("cell.key"), *self.folder.glob("keys/c*.*")]
         kept = {path: path.read_bytes() for path in own}
         for path in own:
@@ -213,7 +222,7 @@ class Guarded:
         else:
             write_key(self.folder / "cell.key", new_key())
         try:
-            return self.petrobot(*arguments)
+            return await self.give(*arguments)
         finally:
             for path, data in kept.items():
                 path.write_bytes(data)
@@ -260,10 +269,16 @@ def _forms(secret: str) -> list[bytes]:
 
 
 @pytest.mark.parametrize("how", ["shared key", "certificates"])
-async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: str) -> None:
+async def test_a_guarded_cell_works_and_keeps_its_secrets(
+    tmp_path: Path,
+    how: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Nodes, run, log and emergency stop work with keys, and no output, log, journal or report
     shows one."""
-    cell = Guarded(tmp_path, how)
+    monkeypatch.chdir(tmp_path)
+    cell = Guarded(tmp_path, how, capsys)
     token: dict[str, str] = {}
 
     async def look_for_token(done: asyncio.Future[Any]) -> None:
@@ -283,22 +298,14 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
         done = await running
         assert done.returncode == 0, done.stderr
         assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
-        assert (await asyncio.to_thread(cell.petrobot, "nodes", "--json", "-")).returncode == 0
-        assert (
-            await asyncio.to_thread(cell.petrobot, "log", "last", "--format", "jsonl")
-        ).returncode == 0
-        assert (await asyncio.to_thread(cell.petrobot, "estop", "--json", "-")).returncode == 0
-        assert (
-            cell.petrobot("estop", "--clear", "--services", str(cell.directory.source)).returncode
-            == 0
-        )
-        stranger = await asyncio.to_thread(
-            cell.with_strange_keys, "run", "sweeping.toml", "--no-page", "--quiet"
-        )
-        assert stranger.returncode == 3 and "motion" in stranger.stderr
-        assert (
-            "expected the certificate of" if how == "certificates" else "wrong_key"
-        ) in stranger.stderr
+        assert (await cell.give("nodes", "--json", "-"))[0] == 0
+        assert (await cell.give("log", "last", "--format", "jsonl"))[0] == 0
+        assert (await cell.give("estop", "--json", "-"))[0] == 0
+        assert (await cell.give("estop", "--clear"))[0] == 0
+        code, why = await cell.with_strange_keys("run", "sweeping.toml", "--no-page", "--quiet")
+        assert code == 3 and "motion" in why
+        expected = "expected the certificate of" if how == "certificates" else "wrong_key"
+        assert expected in why
     assert token["page token"] and cell.secrets()
     assert list(tmp_path.glob("logs/*.log")) and (tmp_path / "report" / "index.html").exists()
     assert cell.leaks(token) == []

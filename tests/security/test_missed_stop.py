@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import pytest_asyncio
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import local_programs
@@ -31,7 +32,7 @@ from tests.integration.test_two_coordinators import mission_on
 from tests.security.test_estop import finished, petrobot
 from tests.waiting import beat, until
 
-pytestmark = pytest.mark.processes
+pytestmark = [pytest.mark.processes, pytest.mark.asyncio(loop_scope="module")]
 PATIENCE = 60.0
 TASK = """\
 schema = 1
@@ -71,13 +72,16 @@ async def arrange(ctx, *, seed, runs):
 class Turns:
     """The nodes of two hands, and coordinators that move them in turn."""
 
-    def __init__(self, folder: Path, supervisor: Supervisor, more: str = "") -> None:
-        """`more`: a line of the task."""
+    def __init__(
+        self, folder: Path, runs: Path, supervisor: Supervisor | None = None, more: str = ""
+    ) -> None:
+        """`folder` has the location file, `runs` is for the runs; `more`: a line of the task."""
         self.more = more
         self.folder = folder
+        self.runs = runs
         self.supervisor = supervisor
         self._services = ["--services", str(folder / "services.toml")]
-        self._journal = ["--journal", str(folder / "runs")]
+        self._journal = ["--journal", str(runs)]
 
     def task(self, pause: float) -> Path:
         """Write the task, with this pause before each turn (s)."""
@@ -126,6 +130,7 @@ class Turns:
 
     async def restart_nodes(self) -> None:
         """Kill both nodes, and wait until they are ready again."""
+        assert self.supervisor is not None
         starts = {name: self.supervisor.starts(name) for name in ("left", "right")}
         for pid in self.supervisor.process_ids().values():
             os.kill(pid, signal.SIGKILL)
@@ -142,7 +147,7 @@ class Turns:
 
         def published() -> bool:
             assert coordinator.poll() is None, coordinator.communicate()
-            for file in (self.folder / "runs").glob(f"*/{ADDRESS_FILE}"):
+            for file in self.runs.glob(f"*/{ADDRESS_FILE}"):
                 if json.loads(file.read_text())["process"] == coordinator.pid:
                     found.append(file.parent)
             return bool(found)
@@ -176,12 +181,22 @@ async def give(address: str, verb: str, **data: object) -> dict[str, Any]:
     return await asyncio.to_thread(ask)
 
 
-@pytest.fixture
-async def turns(tmp_path: Path) -> AsyncIterator[Turns]:
-    directory = load(shuttle_services(tmp_path, fetch=0.03, carry=0.03))
-    programs = local_programs(directory)
-    async with Supervisor(programs, tmp_path / "logs", respawn=True) as supervisor:
-        yield Turns(tmp_path, supervisor)
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def nodes(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[tuple[Path, Supervisor]]:
+    """Both nodes and their folder, for all tests that do not need nodes of their own."""
+    folder = tmp_path_factory.mktemp("cell")
+    programs = local_programs(load(shuttle_services(folder, fetch=0.03, carry=0.03)))
+    async with Supervisor(programs, folder / "logs", respawn=True) as supervisor:
+        yield folder, supervisor
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def turns(nodes: tuple[Path, Supervisor], tmp_path: Path) -> AsyncIterator[Turns]:
+    """Turns of both hands, which are not stopped, with runs of their own."""
+    folder, supervisor = nodes
+    turns = Turns(folder, tmp_path / "runs", supervisor)
+    yield turns
+    await turns.estop("--clear")
 
 
 @pytest.mark.parametrize("restarts", [False, True], ids=["nodes stay", "nodes restart"])
@@ -242,7 +257,7 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     """The coordinator is frozen before it has reached any node, even before it is Python. The
     operator must order it again, and then it moves. So does a run from before the stop whose
     coordinator was killed: to resume it is a decision of the operator."""
-    run = Path()
+    run, then = Path(), turns.begun()
     if command == "resume":
         coordinator = turns.start(1.5)
         run = await turns.connected(coordinator)
@@ -250,7 +265,7 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
         coordinator.communicate()
         await turns.estop()
         await turns.estop("--clear")
-        assert turns.begun() == 0
+        assert turns.begun() == then
         await turns.moved(turns.resume(run))
 
     def order() -> subprocess.Popen[str]:
@@ -283,7 +298,7 @@ async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns
     await turns.moved(coordinator)
     await turns.estop()
     then = turns.begun()
-    another = {"PETROBOT_STATE": str(turns.folder / "another host")}
+    another = {"PETROBOT_STATE": str(turns.runs / "another host")}
     for variables, says in (({}, "still holds the devices"), (another, "left_hand: emergency")):
         code, out, err = await finished(turns.resume(run, **variables))
         assert (code, turns.begun()) == (2, then) and says in err, out + err
@@ -302,6 +317,7 @@ async def test_a_stop_and_another_run_refuse_a_resume_as_they_refuse_a_run(turns
 async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns: Turns) -> None:
     """It was pressed while the page's process was frozen, or just before."""
     turns.task(0.02)
+    then = turns.begun()
     page = turns.serve()
     try:
         address = await asyncio.to_thread(page_address, page)
@@ -314,7 +330,7 @@ async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns
         await turns.estop("--clear")
         page.send_signal(signal.SIGCONT)
         answer = await pressed
-        assert (answer["ok"], answer["code"], turns.begun()) == (False, "stopped", 0), answer
+        assert (answer["ok"], answer["code"], turns.begun()) == (False, "stopped", then), answer
         assert "order it again" in answer["text"]
         await beat(ARREARS)
         # On a busy host the test was silent for so long that the controls are free.
@@ -329,7 +345,7 @@ async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns
 
 async def test_nodes_that_start_after_a_stop_was_cleared_know_when(tmp_path: Path) -> None:
     """Here they did not run: the stop and its clearing are on disk."""
-    turns = Turns(tmp_path, Supervisor([], tmp_path / "logs"))
+    turns = Turns(tmp_path, tmp_path / "runs")
     directory = load(shuttle_services(tmp_path, fetch=0.03, carry=0.03))
     coordinator = turns.start(0.02, "--up")
     try:
@@ -360,8 +376,8 @@ async def test_a_stop_during_the_preparation_ends_the_run(tmp_path: Path) -> Non
     table = '[services.arrange]\nrun = "lab:arrange"\nnode = "left"\n'
     services.write_text(services.read_text() + table, encoding="utf-8")
     directory = load(services)
-    async with Supervisor(local_programs(directory), tmp_path / "logs") as nodes:
-        turns = Turns(tmp_path, nodes, 'prepare = "arrange"')
+    async with Supervisor(local_programs(directory), tmp_path / "logs"):
+        turns = Turns(tmp_path, tmp_path / "runs", more='prepare = "arrange"')
         coordinator = turns.start(0.02)
         try:
             await until((tmp_path / "arranging").exists, "the preparation")

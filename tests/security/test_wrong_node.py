@@ -19,7 +19,7 @@ import pytest
 from petrobot.services.comm.protocol.security import new_key, write_key
 from tests.node.test_processes import Nodes
 from tests.ports import free_ports
-from tests.security.test_estop import finished, petrobot
+from tests.security.conftest import Said
 
 pytestmark = pytest.mark.processes
 HOST = "127.0.0.1"
@@ -104,8 +104,9 @@ class Middle:
 class Deceived:
     """Two nodes, and the addresses at which their callers look for them."""
 
-    def __init__(self, folder: Path, keyed: bool) -> None:
+    def __init__(self, folder: Path, keyed: bool, said: Said) -> None:
         self.folder = folder
+        self._said = said
         self.keyed = keyed
         left, right = free_ports(2)
         self.ports = {"left": left, "right": right}
@@ -128,16 +129,10 @@ class Deceived:
     async def estop(self, services: Path) -> tuple[int, dict[str, str]]:
         """Run `petrobot estop`; return its exit code, and by node why it did not answer (empty: it
         did)."""
-        options = [
-            "--services",
-            str(services),
-            "--journal",
-            str(self.folder / "runs"),
-            "--json",
-            "-",
-        ]
-        state = str(self.folder / "state of the caller's host")
-        code, out, err = await finished(petrobot("estop", *options, PETROBOT_STATE=state))
+        options = ["--journal", str(self.folder / "runs"), "--json", "-"]
+        with pytest.MonkeyPatch.context() as environment:
+            environment.setenv("PETROBOT_STATE", str(self.folder / "state of the caller's host"))
+            code, out, err = await self._said("estop", "--services", str(services), *options)
         assert out, err
         return code, {
             one["node"]: one["why"] or "?" * (one["seconds"] is None)
@@ -146,9 +141,9 @@ class Deceived:
 
 
 @asynccontextmanager
-async def deceived(folder: Path, keyed: bool) -> AsyncIterator[Deceived]:
+async def deceived(folder: Path, keyed: bool, said: Said) -> AsyncIterator[Deceived]:
     """Start the two nodes as processes, with a shared key or without."""
-    cell = Deceived(folder, keyed)
+    cell = Deceived(folder, keyed, said)
     if keyed:
         write_key(folder / "cell.key", new_key())
     (folder / "services.toml").write_text(cell.text)
@@ -162,10 +157,12 @@ async def deceived(folder: Path, keyed: bool) -> AsyncIterator[Deceived]:
 
 
 @pytest.mark.parametrize("keyed", [True, False], ids=["shared key", "no key"])
-async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed: bool) -> None:
+async def test_estop_names_each_node_that_was_not_reached(
+    tmp_path: Path, keyed: bool, said: Said
+) -> None:
     """Both addresses lead to one node, both are swapped, or one leads to a wrong node: the exit
     code is never 0, and only nodes that were really reached are reported as stopped."""
-    async with deceived(tmp_path, keyed) as cell:
+    async with deceived(tmp_path, keyed, said) as cell:
         straight = await cell.between(left="left", right="right")
         assert await cell.estop(straight) == (0, {"left": "", "right": ""}), (
             "somebody who only listens changes nothing"
@@ -182,10 +179,10 @@ async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed:
             ), told
 
 
-async def test_a_replayed_session_stops_no_device(tmp_path: Path) -> None:
+async def test_a_replayed_session_stops_no_device(tmp_path: Path, said: Said) -> None:
     """The right node's answers to an earlier `estop` are replayed: their proof is of other
     nonces."""
-    async with deceived(tmp_path, True) as cell:
+    async with deceived(tmp_path, True, said) as cell:
         services = await cell.between(left="left", right="right")
         assert (await cell.estop(services))[0] == 0
         for middle in cell.middles:
@@ -194,14 +191,12 @@ async def test_a_replayed_session_stops_no_device(tmp_path: Path) -> None:
         assert code == 3 and all("wrong_key" in why for why in told.values()), told
 
 
-async def test_nodes_shows_a_wrong_port(tmp_path: Path) -> None:
+async def test_nodes_shows_a_wrong_port(tmp_path: Path, said: Said) -> None:
     """Two ports are swapped in services.toml, without a key: each node is reported as the other,
     and neither as up."""
-    async with deceived(tmp_path, False) as cell:
+    async with deceived(tmp_path, False, said) as cell:
         services = await cell.between(left="right", right="left")
-        code, out, err = await finished(
-            petrobot("nodes", "--services", str(services), "--json", "-")
-        )
+        code, out, err = await said("nodes", "--services", str(services), "--json", "-")
         told = json.loads(out)
         assert code == 3, err
         assert "this is right, but the client asked for left" in told["left"]["why"]
