@@ -148,7 +148,7 @@ def check_driver(
         *_, (where, _) = traceback.walk_tb(fault.__traceback__)
         if where.f_code.co_filename == __file__:  # no fault of the driver, but a bug here
             raise
-        verb = "hangs" if isinstance(fault, Hung) else "raised"
+        verb = "hangs:" if isinstance(fault, Hung) else "raised"
         check.fault(f"the driver {verb} {describe(fault)}")
     finally:  # also after Ctrl-C: the device may be moving
         check.end()
