@@ -30,7 +30,10 @@ from typing import Any
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import LIMITS, Driver, QuickStopping, keys_of
+from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.rehearsal import TestPorts
+from petrobot.services.worker.callables import RAISED, describe
+from petrobot.services.worker.runner import Hung
 
 Command = Mapping[str, Any]
 REST, PART = 20, 0.25
@@ -45,6 +48,8 @@ SLOWEST, NOISE = 0.05, 5.0
 more than this multiple of its change at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
+FAULTS = (*RAISED, Hung)
+"""What code of a driver may raise, or the watchdog in it."""
 WAIT = 0.03
 """Seconds that a method may wait if the period is shorter."""
 BUSY = 0.3
@@ -128,18 +133,23 @@ def check_driver(
     if isinstance(make, type):
         make = partial(_made, make, clock.monotonic)
     make = partial(make, **keys) if keys else make
-    check = _Check(_with_ports(make, clock.monotonic), clock, within, first, positions, progress)
+    make = _with_ports(make, clock.monotonic)
+    try:
+        check = _Check(make, clock, within, first, positions, progress)
+    except Hung as fault:
+        return DriverCheck([f"it cannot be made: {describe(fault)}"])
     try:
         check.rules(commands, seconds, cable)
         if isinstance(clock, _Clock):
             check.seeds(clock, commands)
     except _TooLongError as fault:
         check.fault(str(fault))
-    except Exception as fault:
+    except FAULTS as fault:
         *_, (where, _) = traceback.walk_tb(fault.__traceback__)
         if where.f_code.co_filename == __file__:  # no fault of the driver, but a bug here
             raise
-        check.fault(f"the driver raised {type(fault).__name__}: {fault}")
+        verb = "hangs:" if isinstance(fault, Hung) else "raised"
+        check.fault(f"the driver {verb} {describe(fault)}")
     finally:  # also after Ctrl-C: the device may be moving
         check.end()
     return check.found
@@ -254,12 +264,17 @@ class _Check:
         self.begun = self.scheduled()
         self.threads, self.children = set(threading.enumerate()), set(_children())
         """Threads and processes that are not the driver's."""
+        self.libraries = set[threading.Thread]()
+        """Threads that were left behind when a driver was closed for the first time that any
+        were."""
         self.excepthook, threading.excepthook = threading.excepthook, self.thread_raised
         self.leaves: dict[str, Any] = {}
         """The last state, by path."""
         self.sizes: list[Counter[str]] = []
         """Items and characters of each key of the state, after each step of the present driver."""
-        self.driver = make()
+        self.watch = Watchdog("test")
+        with self.watch:
+            self.driver = make()
         self.period = max(0.0, self.driver.period or 0.0) or 0.01
         self.idle: dict[str, float] = {}
         """By how much each number of the state usually changes in a step at rest."""
@@ -290,8 +305,11 @@ class _Check:
         """Return the numbers of the state that may tell where the device is, by path."""
         try:
             state = plain(self.ask(self.driver.state), "state")
-        except Exception as fault:
-            self.fault(f"state: expected plain data, got {type(fault).__name__}: {fault}")
+        except RAISED as fault:
+            self.fault(f"state: expected plain data, got {describe(fault)}")
+            return {}
+        if not isinstance(state, dict):
+            self.fault(f"state: expected a table, got {state!r:.60}")
             return {}
         self.leaves = found = _leaves(state, LONGEST_ROW)
         for name, value in found.items():
@@ -324,7 +342,8 @@ class _Check:
         before, asked = getrusage(RUSAGE_THREAD).ru_nvcsw, method == self.sleep
         begin, used = time.perf_counter(), time.process_time() + self.scheduled()[1]
         try:
-            return method(*given)
+            with self.watch:
+                return method(*given)
         finally:
             idle = time.perf_counter() - begin - (given[0] if asked else 0.0)
             if idle > max(WAIT, self.period):  # else its cause, which takes long to read, is equal
@@ -429,18 +448,20 @@ class _Check:
     def again(self, what: str, **keys: Any) -> None:
         """Close the driver and make another one, with further keys."""
         self.progress(what)
+        self.close()
+        if not self.libraries:  # a library keeps threads of its first user
+            self.libraries = set(threading.enumerate()) - self.threads
         try:
-            self.close()
-            self.threads.update(threading.enumerate())  # a library keeps some of its first user
-            self.driver, self.fresh = self.make(**keys), True
+            with self.watch:
+                self.driver, self.fresh = self.make(**keys), True
             self.run(REST * self.period)
-        except Exception as fault:
-            self.fault(f"{what}: {type(fault).__name__}: {fault}")
+        except RAISED as fault:
+            self.fault(f"{what}: {describe(fault)}")
 
     def refusal(self) -> None:
         try:
             self.ask(self.driver.command, self.now(), UNKNOWN)
-        except Exception:  # the rule: any exception refuses
+        except RAISED:  # the rule: any exception refuses
             return
         self.fault(f"command: accepted {dict(UNKNOWN)}; raise ValueError for what it does not know")
 
@@ -784,8 +805,8 @@ class _Check:
         """Give a command; return whether it was accepted."""
         try:
             self.ask(self.driver.command, self.now(), command)
-        except Exception as fault:
-            self.refusing = f"{type(fault).__name__}: {fault}"
+        except RAISED as fault:
+            self.refusing = f"{describe(fault)}"
             return False
         self.refusing = ""
         return True
@@ -802,8 +823,8 @@ class _Check:
         self.ask(stop, self.now())
         try:
             self.ask(stop, self.now())
-        except Exception as fault:
-            self.fault(f"{stop.__name__}, a second time: {type(fault).__name__}: {fault}")
+        except RAISED as fault:
+            self.fault(f"{stop.__name__}, a second time: {describe(fault)}")
         self.stands(what, positions)
 
     def stands(self, what: str, positions: Mapping[str, float] | None = None) -> None:
@@ -849,7 +870,7 @@ class _Check:
                 self.fault(f"cable pulled: stopped() is still True after {seconds:g} s")
             self.run(self.within)
             raised = False
-        except Exception:  # the rule: the node then makes a new driver
+        except RAISED:  # the rule: the node then makes a new driver
             raised = True
         self.plug(cable, True)
         if raised:
@@ -895,7 +916,11 @@ class _Check:
                     "newest few items"
                 )
         self.sizes.clear()
-        self.driver.close()
+        try:
+            with self.watch:
+                self.driver.close()
+        except RAISED as fault:
+            self.fault(f"close: {describe(fault)}")
 
     def seeds(self, clock: _Clock, commands: Sequence[Command]) -> None:
         """Check that two runs are equal, as their seeds are, if both begin with the same state."""
@@ -903,7 +928,8 @@ class _Check:
         for _ in range(2 if isinstance(getattr(self.driver, "ports", None), TestPorts) else 0):
             clock.passed = 0.0
             self.close()
-            self.driver = self.make()
+            with self.watch:
+                self.driver = self.make()
             run = [self.numbers()]
             for command in (*self.first, *commands):
                 self.accepts(command)
@@ -920,16 +946,22 @@ class _Check:
     def end(self) -> None:
         """Stop and close the driver, whatever happened."""
         try:
-            self.driver.stop(self.now())
-        except Exception as fault:
-            self.fault(f"stop at the end: {type(fault).__name__}: {fault}")
+            with self.watch:
+                self.driver.stop(self.now())
+        except FAULTS as fault:
+            self.fault(f"stop at the end: {describe(fault)}")
         finally:
-            self.close()
+            with suppress(Hung):  # that was found before
+                self.close()
+            self.watch.close()
             pairs = zip(self.scheduled(), self.begun, strict=True)
             ran, queued = (now - then for now, then in pairs)
             if self.schedule >= 0:
                 os.close(self.schedule)
-        end, left = time.monotonic() + LEAVING, set(threading.enumerate()) - self.threads
+        end, left = (
+            time.monotonic() + LEAVING,
+            set(threading.enumerate()) - self.threads - self.libraries,
+        )
         for thread in left:
             thread.join(max(0.0, end - time.monotonic()))
         if names := {thread.name for thread in left if thread.is_alive()}:

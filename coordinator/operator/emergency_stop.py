@@ -10,6 +10,7 @@ NMT (CiA 301: a drive that leaves OPERATIONAL while it moves stops, object 6007h
 from __future__ import annotations
 
 import asyncio
+import os
 import secrets
 import time
 from collections.abc import Mapping
@@ -30,7 +31,7 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.security import KeyFileError
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.comm.tls.credentials import Credentials, credentials
-from petrobot.services.host.emergency_latch import ALL, Cleared, LatchError, latch_of
+from petrobot.services.host.emergency_latch import ALL, FOLDER, STATE, Cleared, LatchError, latch_of
 
 STOP = EMERGENCY_STOP
 CLEAR = "clear_emergency"
@@ -302,8 +303,11 @@ async def _latch(directory: Directory, node: str) -> str:
         path = await asyncio.to_thread(latch_of(directory.source, node).stop, stopped)
     except LatchError as fault:
         return f"not latched: {fault}; do not start {node} again before the cell is safe"
+    # The last folder is of this user: a node that another user runs does not look there.
+    shared = os.environ.get(STATE) or path.parent.name == FOLDER
+    whose = directory.source if shared else f"{directory.source} as this user"
     return (
-        f"latched: a {node} that runs with {directory.source} keeps its devices stopped, by "
+        f"latched: a {node} that runs with {whose} keeps its devices stopped, by "
         f"{path}, until `petrobot estop --clear`"
     )
 

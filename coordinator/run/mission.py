@@ -33,6 +33,7 @@ from petrobot.services.comm.protocol.messages import (
     Call,
     Command,
     Event,
+    Executed,
     Feedback,
     Outcome,
     Welcome,
@@ -528,8 +529,10 @@ class Mission:
     def _answered(self, now: float, node: str, outcome: Outcome) -> None:
         if outcome.status != Status.SUCCESS:
             what = outcome.id.rpartition("/")[2]
+            lost = outcome.executed == Executed.UNKNOWN
+            why = f"; `petrobot log {node}` may say why" if lost else ""
             raise MissionError(
-                f"{what}: {outcome.text or outcome.cause}",
+                f"{what} on {node}: {outcome.text or outcome.cause}{why}",
                 bad_input=outcome.cause == "bad_arguments",
             )
         store, stage = self.executor.store, self.stage

@@ -18,8 +18,8 @@ def write_whole(
 ) -> None:
     """Replace the file's content, synced to disk before this returns.
 
-    `mode` is the file's mode (None: that of the existing file, else the default). With `fresh` an
-    existing file is left as it is. What is not a regular file (a terminal, a pipe) is written to
+    `mode` is the file's mode (None: that of the existing file, else the default). With `fresh` what
+    exists is left as it is; else what is not a regular file (a terminal, a pipe) is written to
     directly. Raises FileExistsError with `fresh`, else OSError; both name the path. No draft is
     left behind.
     """
@@ -27,7 +27,7 @@ def write_whole(
     data = content.encode("utf-8") if isinstance(content, str) else content
     draft = path.with_name(f".{path.name[-200:]}.{os.getpid()}")
     try:
-        if path.exists() and not path.is_file():
+        if not fresh and path.exists() and not path.is_file():
             path.write_bytes(data)
             return
         if mode is None:

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 from petrobot.services.action import Status
@@ -22,6 +23,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
+from petrobot.services.node.watchdog import UNWATCHED
 from petrobot.services.worker.callables import RAISED, describe, log_fault
 from petrobot.services.worker.context import Report
 from petrobot.services.worker.remote import (
@@ -105,12 +107,13 @@ class InlineHost:
         virtual: bool = False,
         reseed: Callable[[int], None] | None = None,
         device: str = "",
+        watch: AbstractContextManager[None] = UNWATCHED,
     ) -> None:
         """`reseed` is called with the seed of each call, for the random draws of the driver.
-        `device` is its name, for messages."""
+        `device` is its name, for messages. `watch` is entered while actions are executed."""
         self._actions = actions
         self._device = f"device {device}: " if device else ""
-        self._reseed = reseed
+        self._reseed, self._watch = reseed, watch
         self._driver = driver
         self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
         self._remote = RemoteDriver(self._post, clock)
@@ -164,7 +167,8 @@ class InlineHost:
         if self._reseed is not None and isinstance(order, Call):
             self._reseed(order.seed)
         held = self._runner.held and bool(self._runner.runs)
-        self._runner.take(now, order)
+        with self._watch:
+            self._runner.take(now, order)
         if held and not self._runner.runs:
             self._carry_out(now, "release")  # what was held was stopped before it began
 
@@ -278,7 +282,8 @@ class InlineHost:
     def _advance(self, now: float) -> None:
         self._end_barred(now)
         held = self._runner.held and bool(self._runner.runs)
-        self._runner.advance(now)
+        with self._watch:
+            self._runner.advance(now)
         if held and not self._runner.runs:
             self._carry_out(now, "release")  # what was held is over
         if self._cyclic is None or self._driver is None or not self._driver.period:

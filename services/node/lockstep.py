@@ -302,15 +302,13 @@ class LockstepNode:
         self._guarded(self._advance, now)
 
     def _guarded(self, step: Callable[..., None], *arguments: Any) -> None:
-        self._watchdog.begin()
         try:
-            step(*arguments)
+            with self._watchdog:
+                step(*arguments)
         except Hung as fault:  # in a driver or a service; an action would have ended its own run
             raise CellError(f"node {self.name}: {describe(fault)}") from fault
         except DeviceError as fault:
             raise CellError(f"node {self.name}: {fault}") from fault
-        finally:
-            self._watchdog.end()
 
     def _advance(self, now: float) -> None:
         self._now = now

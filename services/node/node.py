@@ -8,6 +8,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from petrobot.services.comm.calls.callee import (
 )
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.events import STOP_EVENT
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.calls.peers import NODE
 from petrobot.services.comm.location_file import (
     MEMORY,
@@ -54,6 +56,7 @@ from petrobot.services.host.emergency_latch import Latch
 from petrobot.services.node.emergency_stops import NEVER, EmergencyStops, Write, write_at_once
 from petrobot.services.node.inline_host import Host, InlineHost
 from petrobot.services.node.memory import GlobalMemory, event_name
+from petrobot.services.node.watchdog import UNWATCHED, Watchdog
 from petrobot.services.worker.callables import (
     check_arguments,
     describe,
@@ -102,12 +105,17 @@ class EventTimers:
         return min(self._next.values(), default=None)
 
 
-def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> Inline:
+def inline_service(
+    service: ServiceEntry,
+    raised: Callable[[Event], None],
+    watch: AbstractContextManager[None] = UNWATCHED,
+) -> Inline:
     """Return a service that is a plain function and is answered in the node's loop. Raises
     ImportError if the function cannot be loaded.
 
     The function gets a context and keyword arguments, like an action; it must not use what waits.
-    `raised` is called with its events and with its verdicts on earlier runs.
+    `raised` is called with its events and with its verdicts on earlier runs. `watch` is entered
+    while it is executed.
     """
     function = resolve(service.run)
 
@@ -127,7 +135,8 @@ def inline_service(service: ServiceEntry, raised: Callable[[Event], None]) -> In
             )
         before = time.process_time()
         try:
-            result = function(context, **call.arguments)
+            with watch:
+                result = function(context, **call.arguments)
         except BaseException as fault:  # SystemExit of a service must not end the node
             if from_outside(fault):
                 raise
@@ -221,13 +230,15 @@ class Node:
         """Whether a script (`--mock`) replaces actions of this node."""
         self.code: Mapping[str, str] = {}
         """Digest of the source of each module that it was started with (`sources`)."""
+        # In lock step the whole step of the node is watched.
+        self._watch = UNWATCHED if virtual else Watchdog(name, LinkTiming().silence)
         services = [s for s in directory.services.values() if s.node == name and s.run]
         waiting = {
             s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))
         }
         self.places: dict[str, Host] = {
             **places,
-            LOOP: InlineHost(waiting, clock=clock, virtual=virtual),
+            LOOP: InlineHost(waiting, clock=clock, virtual=virtual, watch=self._watch),
         }
         self.memory = GlobalMemory(self._memory_changed)
         self._connect = connect
@@ -281,7 +292,7 @@ class Node:
             return {call: Offer(scope, inline=self._memory_call) for call in MEMORY_CALLS}
         if waits or not service.run:
             return {service.name: Offer(scope)}
-        inline: Inline = inline_service(service, self._raise)
+        inline: Inline = inline_service(service, self._raise, self._watch)
         return {service.name: Offer(scope, inline=inline)}
 
     def caller(self, peer: str) -> Caller:

@@ -1,8 +1,9 @@
-"""Interrupts code that hangs in lock step: code that does not return would stop simulated time for
-ever, and there is no other process that could end it.
+"""Interrupts code that hangs in a step of a node: in lock step, where it would stop simulated time
+for ever, and in the services that a node executes in its own loop, where the node would answer
+nobody. There is no other process that could end it.
 
-The same process runs everything in lock step, so code that ends it would end the command without a
-word. `os._exit` raises SystemExit there instead, and Python names the line at a crash.
+Code that ends this process would end the command, or the node, without a word. `os._exit` raises
+SystemExit there instead, and Python names the line at a crash.
 
 A thread checks the current step of a node. It counts the processor time that the step has used and
 the time that it slept. On a busy machine a step that does not hang may take long, but then it does
@@ -20,6 +21,7 @@ import sys
 import threading
 import time
 import weakref
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -45,16 +47,20 @@ WAKE = signal.SIGURG
 interrupted. By default a process ignores it."""
 ENDING = (signal.SIGALRM, signal.SIGVTALRM, signal.SIGPROF)
 """Signals of a process's timers, which end it by default."""
+UNWATCHED: AbstractContextManager[None] = nullcontext()
+"""Stands for a watchdog where none is needed."""
 _exit = os._exit
 _raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 class Watchdog:
-    """Watches the steps of one node. `begin` and `end` must be cheap: they are called at each
-    tick."""
+    """Watches the steps of one node: `with watchdog:` is a step. That must be cheap: it is done at
+    each tick."""
 
-    def __init__(self, node: str) -> None:
-        self._node = node
+    def __init__(self, node: str, slow: float = LIMIT) -> None:
+        """A step that takes longer than `slow` s is logged."""
+        self._node, self._slow = node, slow
+        self._logged = False
         self._step = 0
         """Odd during a step."""
         self._thread: threading.Thread | None = None
@@ -62,7 +68,7 @@ class Watchdog:
         self._watched = self._clock = 0
         self._seen, self._used, self._before, self._attempts = 0, 0.0, 0.0, 0
 
-    def begin(self) -> None:
+    def __enter__(self) -> None:
         """Note that the node's code is called now, in this thread."""
         if self._thread is None:
             # A weak reference: a cell that is not closed must still be freed with its last user.
@@ -80,7 +86,7 @@ class Watchdog:
         self._clock = time.pthread_getcpuclockid(self._watched)
         self._step += 1
 
-    def end(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Note that the code has returned."""
         self._step += 1
         _steps.clear()
@@ -94,11 +100,21 @@ class Watchdog:
         now = _processor_time(self._clock)
         if self._step != self._seen or self._seen % 2 == 0:
             self._seen, self._used, self._attempts = self._step, 0.0, 0
+            self._logged = False
         else:
             spent = now - self._before
             # This thread holds the interpreter now, so the other one waits for it, whatever it did
             # before: it slept only if it has used no processor time either.
             self._used += LOOK if spent < IDLE and _sleeps(self._watched) else spent
+            if self._slow <= self._used < LIMIT and not self._logged:
+                self._logged = True
+                where = _described(sys._current_frames().get(self._watched))
+                _log.warning(
+                    "node %s: %s has not come back for %g s, and meanwhile the node answers no one",
+                    self._node,
+                    where,
+                    self._slow,
+                )
             if self._used >= LIMIT:
                 self._used, self._attempts = LIMIT - AGAIN, self._attempts + 1
                 self._interrupt(self._attempts)

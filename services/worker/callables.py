@@ -19,7 +19,9 @@ from types import FrameType
 from typing import Any
 
 _SERVICES = Path(__file__).parents[1]
-_OURS = tuple(f"{_SERVICES}/{each}" for each in ("worker/", "node/", "comm/", "device.py"))
+_OURS = tuple(
+    f"{_SERVICES}/{each}" for each in ("worker/", "node/", "comm/", "device.py", "conformance.py")
+)
 _LIBRARY = f"{Path(os.__file__).parent}/"
 """Files whose frames are left out of the traceback that users see."""
 LONGEST = 2_000

@@ -81,7 +81,7 @@ NEW, RUNNING, COMPUTED, TAKING, STOPPING, SETTLING = ActionPhase
 
 
 class Hung(BaseException):
-    """Raised by the watchdog of lock step in code that has not returned for too long."""
+    """Raised by a watchdog in code that has not returned for too long."""
 
     def __str__(self) -> str:
         return (

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import random
 import subprocess
+import sys
 import threading
 import time
 from collections import deque
@@ -18,6 +20,7 @@ import pytest
 from petrobot.services import conformance
 from petrobot.services.conformance import DriverCheck, check_driver
 from petrobot.services.device import Driver, Ports, key
+from petrobot.services.node import watchdog
 from tests.waiting import Limit
 
 
@@ -430,6 +433,52 @@ class LeavesAThread(Axis):
         threading.Thread(target=time.sleep, args=[60], name="reader", daemon=True).start()
 
 
+class LeavesAThreadForEachCommand(Axis):
+    """The first of them could be one that its library keeps."""
+
+    def command(self, now: float, body: Mapping[str, Any]) -> None:
+        super().command(now, body)
+        threading.Thread(target=time.sleep, args=[60], name="sender", daemon=True).start()
+
+
+class HasAListAsState(Axis):
+    def state(self) -> Any:
+        return [self.at]
+
+
+class CannotBeClosed(Axis):
+    def close(self) -> None:
+        raise OSError("the port is gone")
+
+
+class LeavesInItsStep(Axis):
+    def step(self, now: float) -> None:
+        super().step(now)
+        sys.exit("the library has had enough")
+
+
+class EndsTheProcess(Axis):
+    def stop(self, now: float) -> None:
+        os._exit(0)
+
+
+class Hangs(Axis):
+    how = "stop"
+
+    def stop(self, now: float) -> None:
+        if self.how == "stop":
+            time.sleep(60.0)
+        super().stop(now)
+
+    def close(self) -> None:
+        if self.how == "close":
+            time.sleep(60.0)
+
+
+class HangsInClose(Hangs):
+    how = "close"
+
+
 class WithAThread(Axis):
     """Its thread, which must do something, ends when it is closed."""
 
@@ -516,6 +565,13 @@ class DrawsByItself(Axis):
         (DividesByZero, "state: load.mean is NaN; what is not known yet is None, or left out"),
         (TooLarge, "state: has more than 100,000 items and characters, most of them in image"),
         (LeavesAThread, "close: leaves a thread behind: reader"),
+        (LeavesAThreadForEachCommand, "close: leaves a thread behind: sender"),
+        (HasAListAsState, "state: expected a table, got [0.0]"),
+        (CannotBeClosed, "close: OSError: the port is gone in close (test_conformance.py:"),
+        (LeavesInItsStep, "SystemExit: the library has had enough in step (test_conformance.py:"),
+        (EndsTheProcess, "SystemExit: it called os._exit(0) in stop (test_conformance.py:"),
+        (Hangs, "Hung: did not come back in time"),
+        (HangsInClose, "Hung: did not come back in time"),
         pytest.param(
             LeavesAProcess,
             "close: leaves a process behind: sleep",
@@ -548,7 +604,10 @@ class DrawsByItself(Axis):
     ],
 )
 @pytest.mark.usefixtures("ends_processes")
-def test_each_broken_rule_is_named(kind: type[Axis], fault: str) -> None:
+def test_each_broken_rule_is_named(
+    kind: type[Axis], fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watchdog, "LIMIT", 2.0)
     check = checked(kind)
     # On a very busy computer it cannot be told whose a wait is.
     waiting = kind in (WaitsOnce, WaitsInStop, WaitsForItsThread, ItsThreadKeepsTheLock)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import socket
 import threading
@@ -166,6 +167,7 @@ async def test_the_device_of_a_frozen_node_stops(
 async def test_a_service_that_blocks_the_node_stops_its_devices(
     moved: Moved, operator: Operator, name: str
 ) -> None:
+    """The node's log says which line it was."""
     run = await moving(moved, operator, name)
     blocked = asyncio.create_task(operator.call("block", None, seconds=2.5))
     await asyncio.to_thread(moved.stopped, name)
@@ -173,6 +175,10 @@ async def test_a_service_that_blocks_the_node_stops_its_devices(
     assert end.status == "error" and end.cause in GONE, end
     await blocked
     await usable(operator, name)
+    said = moved.node.log.read_text()
+    assert re.search(
+        r"only: its code in block \(.*actions.py:\d+\) has not come back for 1 s", said
+    )
 
 
 @pytest.mark.processes

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import pytest
 
-from petrobot.services.comm.location_file import ServiceEntry
-from petrobot.services.comm.protocol.messages import Call, Event, Executed
+from petrobot.services.comm.location_file import ActionEntry, ServiceEntry
+from petrobot.services.comm.protocol.messages import Call, Event, Executed, Outcome
+from petrobot.services.node import watchdog
+from petrobot.services.node.inline_host import InlineHost
 from petrobot.services.node.node import inline_service
 
 EVENTS: list[Event] = []
@@ -66,3 +69,27 @@ def test_a_fault_is_one_error_with_its_reason(
         {},
     )
     assert says in outcome.text
+
+
+@pytest.mark.parametrize("waits", [False, True], ids=["def", "async def"])
+def test_one_that_hangs_is_named_and_interrupted(
+    waits: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Else its node would answer no one, for ever."""
+    monkeypatch.setattr(watchdog, "LIMIT", 0.4)
+    monkeypatch.setattr(watchdog, "LOOK", 0.05)
+    watch, call = watchdog.Watchdog("here", 0.1), Call("c1", "it", {})
+    begun = time.monotonic()
+    if waits:
+        entry = {"it": ActionEntry("it", "toy_cell.actions:freeze", "it", "here", "")}
+        host = InlineHost(entry, clock=lambda: 0.0, watch=watch)
+        host.take(0.0, call)
+        host.advance(0.0)
+        (end,) = (said for said in host.reports() if isinstance(said, Outcome))
+    else:
+        function = ServiceEntry("it", "here", "toy_cell.actions:freeze_at_once")
+        end = inline_service(function, EVENTS.append, watch)(0.0, call)
+    watch.close()
+    assert time.monotonic() - begun < 30.0, "it came back by itself"
+    assert (end.status, end.cause) == ("error", "hung") and "(actions.py:" in end.text, end
+    assert "has not come back for 0.1 s, and meanwhile the node answers no one" in caplog.text

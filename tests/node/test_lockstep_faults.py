@@ -214,15 +214,14 @@ def test_a_busy_machine_does_not_trigger_the_watchdog(monkeypatch: pytest.Monkey
     monkeypatch.setattr(watchdog, "_sleeps", lambda thread: False)
     used = [0.0]
     monkeypatch.setattr(watchdog, "_processor_time", lambda thread: used[0])
-    dog.begin()
-    for _ in range(10_000):  # checks of more than an hour
-        dog.look()
-    assert not interrupted
-    for _ in range(int(watchdog.LIMIT) + 2):
-        used[0] += 1.0
-        dog.look()
-    assert interrupted
-    dog.end()
+    with dog:
+        for _ in range(10_000):  # checks of more than an hour
+            dog.look()
+        assert not interrupted
+        for _ in range(int(watchdog.LIMIT) + 2):
+            used[0] += 1.0
+            dog.look()
+        assert interrupted
     dog.look()
     dog.close()
 
@@ -276,8 +275,8 @@ def test_an_ended_thread_does_not_crash_the_watchdog() -> None:
     watched = Watchdog("only")
 
     def step() -> None:
-        watched.begin()
-        watched.end()
+        with watched:
+            pass
 
     for _ in range(20):
         thread = threading.Thread(target=step)

@@ -105,6 +105,14 @@ def test_a_new_file_never_replaces_another(
     assert path.read_text() == "first" and list(tmp_path.iterdir()) == [path]
 
 
+def test_a_fresh_file_is_not_written_to_a_pipe(tmp_path: Path) -> None:
+    """It would hang until someone reads the pipe, who then has the key."""
+    os.mkfifo(path := tmp_path / "cell.key")
+    with pytest.raises(FileExistsError, match=r"cell\.key"):
+        write_whole(path, "secret", fresh=True)
+    assert path.is_fifo() and [*tmp_path.iterdir()] == [path]
+
+
 def test_modes_links_and_pipes_are_kept(tmp_path: Path) -> None:
     file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
     write_whole(file, "1", mode=0o640)

@@ -327,6 +327,8 @@ async def test_a_disk_that_hangs_keeps_no_stop_from_the_bus(tmp_path: Path, file
     home = str(tmp_path / "home")
     code, out, said = await finished(petrobot("estop", *services, XDG_STATE_HOME=home))
     assert code == 3 and "no CAN hub" in out and " latched: " in out, out + said
+    # Only nodes of this user look into the folder of this user.
+    assert (" as this user keeps its devices stopped" in out) is (".petrobot" in file), out
     code, *_ = await finished(petrobot("estop", "--clear", *services, XDG_STATE_HOME=home))
     assert code == 0
 

@@ -55,15 +55,16 @@ def chain(model: str, tool: Sequence[float] = (0.0, 0.0, 0.0)) -> JointChain:
 
 # --- driver ---
 
-OUTPUTS = (
-    *("actual_q", "actual_qd", "robot_mode", "safety_mode"),
-    *("actual_digital_input_bits", "actual_digital_output_bits", "output_int_register_24"),
-)
-SETPOINT = (
-    *("input_int_register_24", "input_int_register_25"),
-    *(f"input_double_register_{n}" for n in range(24, 30)),
-)
-DIGITAL = ("standard_digital_output_mask", "standard_digital_output")
+OUTPUTS = {
+    **dict.fromkeys(("actual_q", "actual_qd"), "VECTOR6D"),
+    **dict.fromkeys(("robot_mode", "safety_mode", "output_int_register_24"), "INT32"),
+    **dict.fromkeys(("actual_digital_input_bits", "actual_digital_output_bits"), "UINT64"),
+}
+SETPOINT = {
+    **dict.fromkeys(("input_int_register_24", "input_int_register_25"), "INT32"),
+    **dict.fromkeys((f"input_double_register_{n}" for n in range(24, 30)), "DOUBLE"),
+}
+DIGITAL = dict.fromkeys(("standard_digital_output_mask", "standard_digital_output"), "UINT8")
 POWER_OFF, IDLE, RUNNING = 3, 5, 7
 SAFETY = {1: "normal", 2: "reduced", 3: "protective_stop", 4: "recovery", 5: "safeguard_stop",
           6: "emergency_stop", 7: "emergency_stop", 8: "violation", 9: "fault", 10: "fault",

@@ -59,14 +59,16 @@ def packages(buffer: bytearray) -> Iterator[tuple[str, bytes]]:
 class Recipe:
     """The fields of a data package, in order."""
 
-    def __init__(self, names: Sequence[str], types: Sequence[str]) -> None:
-        """Raises RtdeError for a field that the controller does not have, or that is in use."""
-        if used := [n for n, t in zip(names, types, strict=False) if t == "IN_USE"]:
+    def __init__(self, fields: Mapping[str, str], types: Sequence[str]) -> None:
+        """`fields`: name and type of each. Raises RtdeError for one that the controller does not
+        have, or has with another type, or that is in use."""
+        found = dict(zip(fields, types, strict=False))
+        if used := [name for name, kind in found.items() if kind == "IN_USE"]:
             raise RtdeError(f"another client or a fieldbus writes {', '.join(used[:2])}: end it")
-        bad = [f"{n} ({t})" for n, t in zip(names, types, strict=False) if t not in FORMS]
-        if bad or len(names) != len(types):
+        bad = [f"{n} as {fields[n]} ({kind})" for n, kind in found.items() if kind != fields[n]]
+        if bad or len(fields) != len(types):
             raise RtdeError(f"the controller does not give {', '.join(bad) or 'all fields'}")
-        self.names = tuple(names)
+        self.names = tuple(fields)
         self._forms = [struct.Struct(f">{FORMS[t]}") for t in types]
         self.size = sum(form.size for form in self._forms)
 
@@ -96,14 +98,15 @@ class Rtde:
     """One connection, from its first byte: requests version and recipes, starts, then receives
     data. `receive` processes bytes, `drain` returns those to send."""
 
-    def __init__(self, outputs: Sequence[str], inputs: Sequence[Sequence[str]]):
-        """`outputs` are received `RATE` times a second; each of `inputs` may be sent."""
+    def __init__(self, outputs: Mapping[str, str], inputs: Sequence[Mapping[str, str]]):
+        """`outputs` are received `RATE` times a second; each of `inputs` may be sent. Both are
+        types by name."""
         self.data: dict[str, Any] = {}
         """The newest values received."""
         self.count = 0
         """How many data packages were received."""
         self.running = False
-        self._outputs, self._inputs = outputs, [tuple(names) for names in inputs]
+        self._outputs, self._inputs = outputs, inputs
         self._recipe: tuple[int, Recipe] | None = None
         self._sent: list[tuple[int, Recipe]] = []
         self._buffer = bytearray()
@@ -142,8 +145,8 @@ class Rtde:
             self._recipe = payload[0], Recipe(self._outputs, _types(payload))
             self._ask_inputs()
         elif letter == INPUTS:
-            names = self._inputs[len(self._sent)]
-            self._sent.append((payload[0], Recipe(names, _types(payload))))
+            fields = self._inputs[len(self._sent)]
+            self._sent.append((payload[0], Recipe(fields, _types(payload))))
             self._ask_inputs()
         elif letter == START:
             if payload != b"\x01":

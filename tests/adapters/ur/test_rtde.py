@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from petrobot.services.adapters.ur.rtde import Recipe, Rtde, RtdeError, package
 from petrobot.sim.bus.ur_controller import RTDE_PORT, UrController
 
-OUT = ("timestamp", "actual_q", "safety_mode")
-IN = (("input_int_register_24", "input_double_register_24"),)
+OUT = {"timestamp": "DOUBLE", "actual_q": "VECTOR6D", "safety_mode": "INT32"}
+IN = ({"input_int_register_24": "INT32", "input_double_register_24": "DOUBLE"},)
 
 
 def recorded() -> bytes:
@@ -58,7 +58,15 @@ ACCEPTED = package("V", b"\x01") + package("O", b"\x01DOUBLE,VECTOR6D,INT32,")
         (package("V", b"\x00"), "refuses RTDE protocol 2"),
         (
             package("V", b"\x01") + package("O", b"\x00DOUBLE,NOT_FOUND,INT32"),
-            "actual_q (NOT_FOUND)",
+            "does not give actual_q as VECTOR6D (NOT_FOUND)",
+        ),
+        (  # one number would be read where six are needed
+            package("V", b"\x01") + package("O", b"\x01DOUBLE,DOUBLE,INT32"),
+            "does not give actual_q as VECTOR6D (DOUBLE)",
+        ),
+        (
+            ACCEPTED + package("I", b"\x01VECTOR3D,DOUBLE"),
+            "does not give input_int_register_24 as INT32 (VECTOR3D)",
         ),
         (package("V", b"\x01") + package("O", b"\x01DOUBLE"), "does not give all fields"),
         (
@@ -117,4 +125,4 @@ def test_no_bytes_break_it_otherwise(data: bytes) -> None:
 @pytest.mark.parametrize("types", [["FLOAT"], [], ["DOUBLE", "DOUBLE"]])
 def test_a_recipe_that_does_not_fit(types: list[str]) -> None:
     with pytest.raises(RtdeError):
-        Recipe(["timestamp"], types)
+        Recipe({"timestamp": "DOUBLE"}, types)

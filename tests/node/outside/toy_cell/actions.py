@@ -317,6 +317,17 @@ def block(ctx: Context, *, seconds: float) -> Result:
     return success(slept=seconds)
 
 
+def freeze_at_once(ctx: Context) -> Result:
+    """Block for longer than a test waits."""
+    time.sleep(60.0)
+    return success()
+
+
+async def freeze(ctx: Context) -> Result:
+    """The same, as a service that may wait."""
+    return freeze_at_once(ctx)
+
+
 def leave_behind(ctx: Context, *, how: str, mark: str, then: str = "return") -> Result:
     """Start a process that survives this action, in one of several ways; its process id is written
     to `mark`. Then return, block, crash or exit."""
