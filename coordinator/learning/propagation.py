@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from math import inf, isnan, log, nan, prod, sqrt
 from pathlib import Path
 from typing import Any
@@ -32,11 +32,12 @@ from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
 from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
+from petrobot.services.comm.location_file import DRY_RUN, MOCK
 
 # --- competing risks ---
 
@@ -104,20 +105,45 @@ ChoiceShares = Mapping[str, Mapping[str, float]]
 
 
 def newest_measured(
-    folder: str, task: Task, devices: Mapping[str, str] | None
+    estimates: str, task: Task, devices: Mapping[str, str] | None, plant: str = ""
 ) -> tuple[Measured, str]:
-    """Return what the newest estimates file of a folder in which something of the task was measured
-    says, and where this is from in words; nothing and an empty text if there is none. Files that
-    cannot be read are left out."""
-    files = [file for file in Path(folder).glob("*.db") if file.is_file()] if folder else []
-    for file in sorted(files, key=lambda file: -file.stat().st_mtime):
-        with suppress(EstimatesError):
-            kept = EstimatesFile(file).read()
-            found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
-            if found.runs:
-                plant = f"plant {kept.plant or 'unknown'}"
-                return found, f"numbers as measured in {file} ({plant}), else as declared"
+    """Return what was measured of a task, and where this is from in words; nothing and an empty
+    text if nothing was. `estimates` is a folder of estimates files, or one of them.
+
+    Measurements of `plant` come first, then those of a real cell, a simulated one, and one that is
+    not known; of the same, those of the newest file. Those with scripted actions or without drives
+    count only for their own plant. Files that cannot be read are left out."""
+    given = Path(estimates)
+    found: list[tuple[tuple[bool, int, int], Path, FileContents]] = []
+    for file in (given.glob("*.db") if given.is_dir() else [given]) if estimates else []:
+        with suppress(EstimatesError, OSError):
+            stamp = _stamp(file)
+            for name in _contents(file, stamp, None).plants:
+                kept = _contents(file, stamp, name)
+                if name == plant or name.partition(" ")[0] not in (MOCK, DRY_RUN):
+                    found.append(((name != plant, kept.rank(name)[0], -max(stamp)[0]), file, kept))
+    for _, file, kept in sorted(found, key=lambda entry: entry[0]):
+        measured = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
+        if measured.runs:
+            of = f"plant {kept.plant or 'unknown'}"
+            of += f", nothing of {plant}" if plant and kept.plant != plant else ""
+            return measured, f"numbers as measured in {file} ({of}), else as declared"
     return Measured(), ""
+
+
+def _stamp(file: Path) -> tuple[tuple[int, int], ...]:
+    """Return (time, size) of an estimates file and of its log, to which SQLite writes first. Raises
+    OSError."""
+    of = [file.stat()]
+    with suppress(FileNotFoundError):
+        of.append(Path(f"{file}-wal").stat())
+    return tuple((s.st_mtime_ns, s.st_size) for s in of if s.st_size)
+
+
+@lru_cache(maxsize=64)
+def _contents(file: Path, stamp: object, plant: str | None) -> FileContents:
+    """Read a file again only when its `stamp` has changed. Raises EstimatesError."""
+    return EstimatesFile(file).read(plant)
 
 
 def measured_from(
