@@ -188,6 +188,8 @@ class Analysis:
     exact: MissionFigures | None = None
     """Figures of missions with exact times, if those of `forecast` are doubtful because of its few
     phases."""
+    missions: MissionFigures | None = None
+    """Missions with exact times, if some could be played."""
     refused: bool = False
     """Whether the task may not run for a reason beyond these verdicts (`may_run`)."""
     fewer: Mapping[int, Analysis] = field(default_factory=dict)
@@ -732,11 +734,11 @@ def with_forecast(
     """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
     without searching again."""
     notes, doubts = list(found.notes), list[str]()
-    numbers = exact = None
+    numbers = exact = missions = None
     try:
         numbers = _forecast(task, measured, stages, limits, notes, devices)
         if numbers is not None:
-            doubts, exact = _doubts(
+            doubts, exact, missions = _doubts(
                 numbers, found.progress, measured, stages, limits, notes, devices
             )
     except KeyboardInterrupt:
@@ -748,6 +750,7 @@ def with_forecast(
         interrupted=CUT in notes,
         doubts=tuple(doubts),
         exact=exact,
+        missions=missions,
     )
 
 
@@ -790,17 +793,18 @@ def _doubts(
     limits: SearchLimits | None,
     notes: list[str],
     devices: Mapping[str, str] | None,
-) -> tuple[list[str], MissionFigures | None]:
+) -> tuple[list[str], MissionFigures | None, MissionFigures | None]:
     """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
     everything but durations, and with missions played on it, whose durations are not divided into
-    phases. Return which figures differ and what only one side assumes, and the figures of those
-    missions if they are among them; add a note where one of the two comparisons cannot be made.
+    phases. Return which figures differ and what only one side assumes, those missions if they are
+    among them, and those missions in any case; add a note where one of the two comparisons cannot
+    be made.
     """
     doubts, failed = list(found.view.doubts), dict[str, str]()
-    exact = list[MissionFigures]()
+    exact, missions = list[MissionFigures](), list[MissionFigures]()
     there: Mapping[str, Callable[[Progress], list[str]]] = {
         "the execution graph": partial(_as_chain, found, measured, stages, limits, devices),
-        "missions with exact times": partial(_as_played, found, measured, stages, exact),
+        "missions with exact times": partial(_as_played, found, measured, stages, exact, missions),
     }
     for what, compared in there.items():
         try:
@@ -812,7 +816,7 @@ def _doubts(
                 raise KeyboardInterrupt from why
             failed.setdefault(_why(why), what)
     notes += [f"the forecast was not compared with {there}: {why}" for why, there in failed.items()]
-    return doubts, next(iter(exact), None)
+    return doubts, next(iter(exact), None), next(iter(missions), None)
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:
@@ -864,12 +868,15 @@ def _as_played(
     measured: Measured | None,
     stages: int,
     exact: list[MissionFigures],
+    missions: list[MissionFigures],
     progress: Progress,
 ) -> list[str]:
     """Return which figures missions with exact times have otherwise, if by more than MATTERS and
     five standard errors, and the execution graph as a chain does not tell them right either: what
-    phases do. Then append those missions to `exact`. Raises NoEstimate, TooLarge and OutOfTime."""
+    phases do. Then append those missions to `exact`, and in any case to `missions`. Raises
+    NoEstimate, TooLarge and OutOfTime."""
     plays, off, chain = played(progress.x, measured), list[str](), progress.chain
+    missions.append(plays)
     for name, value in found.figures.items():
         mean, error = plays.figures[name]
         if 0 < value < 1 and name != TIME:  # a share near 1 may have no miss in so few missions
