@@ -36,7 +36,7 @@ from petrobot.coordinator.learning.estimates_file import EstimatesError, Estimat
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
-from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, PrimitiveTask, Status, Task
 from petrobot.services.comm.location_file import DRY_RUN, MOCK
 
 # --- competing risks ---
@@ -99,6 +99,8 @@ def incidences(times: Sequence[float], causes: Sequence[str | None]) -> dict[str
 
 
 ChoiceShares = Mapping[str, Mapping[str, float]]
+Visits = Mapping[tuple[str, str], float]
+"""Expected runs of each (place, action) in a mission run."""
 
 
 # --- estimates into the stochastic view ---
@@ -490,6 +492,8 @@ class Propagated:
     product: float
     """Product of R over the primitive tasks that every mission run contains; equal to R_conj if the
     they run in series."""
+    uncosted: tuple[str, ...] = ()
+    """Actions of unknown cost: without it C is unknown if they run, else its interval lacks it."""
 
     @property
     def conjunctive(self) -> float:
@@ -590,10 +594,17 @@ def _figures(
             parts[name] = part[0]
             costs |= {(place, a): c for place in places for a, c in part[1].items()}
     needed = [p for p in parts.values() if p.runs > 0]
-    alike = len({p.measure for p in needed}) == 1
+    run = {task.primitive_task_of(place).name for (place, _), n in found.visits.items() if n > 0}
+    alike = len({asked[name].measure for name in run}) == 1
     largest = added(p.runs * p.largest_cost for p in needed) if alike else nan
+    for (place, action), n in found.visits.items():
+        primitive = task.primitive_task_of(place)
+        given = _declared_cost(primitive, action, asked[primitive.name])
+        if (place, action) not in costs and not isnan(given):
+            costs[place, action] = Uncertain(given, given, given)
+            largest += n * given
     weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
-    moves = _moves(task, estimates, found, scenario, costs if alike else {}, asked, scenarios)
+    moves, ran = _moves(task, estimates, found, scenario, costs, asked, scenarios)
     r = found.solved.conjunctive_reliability
     c = _total(found.visits, costs) if alike else nan
     of_r = [(-min(m.low_r, m.high_r), max(m.low_r, m.high_r)) for m in moves.values()]
@@ -615,7 +626,17 @@ def _figures(
         if c == c
         else UNKNOWN,
         prod(p.reliability.value for p in needed),
+        tuple(sorted({action for _, action in ran - {*costs}})) if alike else (),
     )
+
+
+def _declared_cost(primitive: PrimitiveTask, action: str, asked: Question) -> float:
+    """Return what a run costs by the task file, where none was measured: its declared cost, or if
+    the cost is its time, its declared duration; nan if neither is known."""
+    cost = asked.declared_cost(action)
+    if isnan(cost) and asked.measure == "wall" and primitive.estimates:
+        return added(e.share * e.mean for e in primitive.estimates.values())
+    return cost
 
 
 def _of_j(
@@ -643,9 +664,7 @@ def _span(one: float, other: float) -> tuple[float, float]:
     return max(0.0, -one, -other), max(0.0, one, other)
 
 
-def _total(
-    visits: Mapping[tuple[str, str], float], costs: Mapping[tuple[str, str], Uncertain]
-) -> float:
+def _total(visits: Visits, costs: Mapping[tuple[str, str], Uncertain]) -> float:
     """Return the expected cost of a mission run; nan if an action that it runs has none."""
     return added(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
 
@@ -675,13 +694,15 @@ def _moves(
     costs: Mapping[tuple[str, str], Uncertain],
     asked: Mapping[str, Question],
     scenarios: int,
-) -> dict[tuple[str, str], _Move]:
-    """Return the move of each (place, action), for the hardest of so many scenarios.
+) -> tuple[dict[tuple[str, str], _Move], set[tuple[str, str]]]:
+    """Return the move of each (place, action), for the hardest of so many scenarios, and which of
+    them run in any of the solutions.
 
     To first order: one more solution for each action, with its share of SUCCESS changed by STEP.
+    What has no cost is left out.
     """
-    out = {}
-    r, c = found.solved.conjunctive_reliability, _total(found.visits, costs)
+    out, run = {}, {key for key, n in found.visits.items() if n > 0}
+    r, c = found.solved.conjunctive_reliability, _known_total(found.visits, costs)
     for (place, action), known in found.measured.runs.items():
         primitive = task.primitive_task_of(place).name
         tally = reduce(
@@ -694,14 +715,19 @@ def _moves(
         runs = {**found.measured.runs, (place, action): _shifted(known, step)}
         other = _solve(task, replace(found.measured, runs=runs))
         slope_r = (other.solved.conjunctive_reliability - r) / step
-        slope_c = (_total(other.visits, costs) - c) / step if c == c else 0.0
+        slope_c = (_known_total(other.visits, costs) - c) / step
+        run |= {key for key, n in other.visits.items() if n > 0}
         level = 1.0 - (1.0 - asked[primitive].level) / scenarios
         low, high = (bound - tally.reliability for bound in tally.interval(level))
         joint = tally.cost_correlation(asked[primitive].measure)
         out[place, action] = _Move(
             low * slope_r, low * slope_c, high * slope_r, high * slope_c, joint
         )
-    return out
+    return out, run
+
+
+def _known_total(visits: Visits, costs: Mapping[tuple[str, str], Uncertain]) -> float:
+    return _total({key: n for key, n in visits.items() if key in costs}, costs)
 
 
 def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Estimate]:

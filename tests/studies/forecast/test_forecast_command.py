@@ -564,7 +564,7 @@ def test_rounding_errors_give_no_interval(
 def test_a_quantile_that_few_phases_change_is_doubtful(
     shape: int, write_campaign: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Eight phases are enough for durations like those of four phases, not for nearly fixed ones."""
+    """Eight phases are enough for a gamma distribution of shape 4, not for nearly fixed times."""
     random = np.random.default_rng(1)
     text = (
         'schema = 1\n[task]\nname = "wait"\nfinal = "over == 1"\nruns_place = "jobs"\n'
