@@ -867,6 +867,22 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     assert "because `ask` takes it first" in found.reason
 
 
+def test_what_a_winner_took_is_told_where_others_can_fill_the_place() -> None:
+    """`quick` has priority over the task's own way to its end."""
+    net: dict[str, dict[str, Any]] = {
+        "made": {"in": "make:normal", "out": "part go"},
+        "unmade": {"in": "make:error", "out": "part go"},
+        "begin": {"in": "go", "out": "look"},
+        "quick": {"in": "part", "out": "bin", "priority": 1},
+        "seen": {"in": "part look:normal", "out": "done"},
+        "unseen": {"in": "look:error", "out": "look"},
+    }
+    found = judged(
+        make_task("make!=1 look! go part bin done", net, final="done == 1")
+    ).deadlock_free
+    assert found.details[0] == "part: taken by `quick`; only `made`, `unmade` can fill it"
+
+
 def test_a_transition_that_never_fires_names_who_takes_its_runs_first() -> None:
     net = {**SORTING, "tired": {"in": "park:normal", "out": "broken arm", "priority": 2}}
     final, end = "parts == 0 and arm == 1", parse("broken == 1")
