@@ -36,7 +36,7 @@ from petrobot.coordinator.analysis.net.deadlocks import (
 from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net, judged, proven
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.space import INTERRUPTED, SearchLimits, Space, explore
+from petrobot.coordinator.analysis.net.space import INTERRUPTED, LOOK, SearchLimits, Space, explore
 from petrobot.coordinator.analysis.net.structure import (
     Lyapunov,
     Semiflows,
@@ -549,8 +549,6 @@ def analyse(
     )
 
 
-LOOK = 10_000
-"""Markings after which boundedness is checked, before the search continues to its limits."""
 ENDLESS = "the net is unbounded"
 FULL = (
     "the memory was used up: what was found by then holds, the rest is unknown; give more --memory"
