@@ -177,8 +177,8 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     measured = sum(n for source, n in count.items() if source.startswith("measured"))
     told = (
         f"Warm: share of the mean time by the forecast; the bottleneck is {most} with "
-        f"{100 * shares[most]:.0f} % ({'; '.join(own)}). {measured} of {sum(count.values())} numbers "
-        f"are measured. Assumed: {assumed(cell)}."
+        f"{100 * shares[most]:.0f} % ({'; '.join(own)}). {measured} of {sum(count.values())} "
+        f"numbers are measured. Assumed: {assumed(cell)}."
     )
     return Overlay(heat=shares, legend=told)
 
