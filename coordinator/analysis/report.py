@@ -1085,9 +1085,10 @@ def _recovery_row(name: str, r: Recovery, odds: Odds) -> list[str]:
         "-" if r.lost is None else " to ".join(str(n) for n in dict.fromkeys(r.lost)),
     )
     line = name + _columns((*row, path))
+    why = [line for text in r.possible.details for line in wrapped(f"{'':8}{text}", 12).split("\n")]
     if len(line) <= COLUMNS:
-        return [line]
-    return [name + _columns((*row, "")), f"{'':8}way back: {path}"]
+        return [line, *why]
+    return [name + _columns((*row, "")), f"{'':8}way back: {path}", *why]
 
 
 def _probability(p: float) -> str:
