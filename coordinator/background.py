@@ -164,9 +164,11 @@ def analysed(
     cell: Mapping[str, Any] | None = None,
     services: str = "",
     estimates: str = "",
+    plant: str = "",
 ) -> Iterator[dict[str, Any]]:
     """Analyse a task file for the operator's page. `cell` holds the fields of its `Cell`,
-    `services` is the path of its location file, `estimates` the folder of estimates files.
+    `services` is the path of its location file; `estimates` and `plant` are those of
+    `newest_measured`.
 
     Yield the verdicts, and all `findings` of `petrobot check`, first, then the same with the
     forecast, because that may take long. Raises TaskFileError.
@@ -188,7 +190,7 @@ def analysed(
     if found is None:  # not searched because of other errors: here it was asked for
         found = analyse(task, limits=limits, steps=BUDGET.steps, devices=devices)
     yield _shown(found, known) | more
-    measured, source = newest_measured(estimates, task, devices)
+    measured, source = newest_measured(estimates, task, devices, plant)
     timed = with_forecast(found, task, measured=measured, limits=limits, devices=devices)
     if source and timed.forecast is not None:
         timed = replace(timed, notes=(*timed.notes, source))

@@ -26,10 +26,12 @@ from petrobot.coordinator.background import (
     analysed,
 )
 from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
-from petrobot.coordinator.learning.estimates_file import EstimatesFile
+from petrobot.coordinator.learning.estimates_file import EstimatesFile, FileContents
 from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.propagation import newest_measured
 from petrobot.coordinator.page.task_work import export
 from petrobot.coordinator.task import Status
+from petrobot.coordinator.task.file import loads
 from tests.waiting import until
 
 CATCH_BALL = (Path(background.__file__).parent / "tasks" / "catch_ball.toml").read_text(
@@ -112,6 +114,56 @@ def test_the_forecast_takes_the_newest_measured_numbers_and_names_their_file(
     assert measured["figures"][key] > declared["figures"][key] + 3.0
     drawn = export(CATCH_BALL, "catch_ball.toml", "gspn.svg", None, str(tmp_path)).text
     assert "new.db" in drawn and "measured in 1 run" in drawn
+
+
+def test_forecasts_take_the_numbers_of_the_own_plant_first(tmp_path: Path) -> None:
+    """A newer file of scripted actions counts only where actions are scripted, too."""
+
+    def note(plant: str) -> str:
+        *_, answer = analysed(CATCH_BALL, "catch_ball.toml", None, "", str(tmp_path), plant)
+        return " ".join(answer["notes"])
+
+    for age, plant in enumerate(("mock", "simulated", "real one", "dry-run")):
+        made, file = Estimates(), tmp_path / f"{plant}.db"
+        key = TallyKey("locate_ball", "locate_hough", "")
+        made.tallies[key] = Tally().adding(Observation(Status.SUCCESS, 4.0), "t")
+        EstimatesFile(file).add(made, {}, plant=plant)
+        os.utime(file, (1e9 - age, 1e9 - age))
+    assert "mock.db (plant mock), else" in note("mock")
+    assert "simulated.db (plant simulated), else" in note("simulated")
+    assert "real one.db (plant real one, nothing of real two), else" in note("real two")
+    (tmp_path / "real one.db").unlink()
+    assert "simulated.db (plant simulated, nothing of real two), else" in note("real two")
+    (tmp_path / "simulated.db").unlink()
+    assert "numbers as measured" not in note("real two")
+    assert "dry-run.db" in note("dry-run")
+
+
+def test_an_estimates_file_is_read_again_only_when_it_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = EstimatesFile(tmp_path / "lab.db")
+    made = Estimates()
+    key = TallyKey("locate_ball", "locate_hough", "")
+    made.tallies[key] = Tally().adding(Observation(Status.SUCCESS, 4.0), "t")
+    file.add(made, {})
+    task, read = loads(CATCH_BALL, "catch_ball.toml"), EstimatesFile.read
+    asked: list[str | None] = []
+
+    def counted(file: EstimatesFile, plant: str | None = None) -> FileContents:
+        asked.append(plant)
+        return read(file, plant)
+
+    monkeypatch.setattr(EstimatesFile, "read", counted)
+    for runs in (1, 1, 2):
+        if runs == 2:
+            file.add(made, {})
+        measured, _ = newest_measured(str(tmp_path), task, None)
+        [source] = measured.sources.values()
+        assert source.startswith(f"measured in {runs} run")
+        assert len(asked) == 2 * runs
+    (tmp_path / "gone.db").symlink_to(tmp_path / "removed meanwhile")
+    assert newest_measured(str(tmp_path), task, None)[1]
 
 
 @pytest.mark.processes

@@ -5,7 +5,9 @@ Clocks and random generators come from the caller.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import hypot, isfinite, sqrt
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.execution.chain import played
+from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
 from petrobot.coordinator.analysis.execution.progress import progress_of
 from petrobot.coordinator.analysis.formats import FORMATS, read_net, written
 from petrobot.coordinator.analysis.formats.netfile import (
@@ -40,7 +42,13 @@ from petrobot.coordinator.analysis.time.simulate import (
     simulate,
 )
 from petrobot.coordinator.analysis.time.stochastic import StochasticView, stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import MATTERS, TIME, rough_fits, timer_shares
+from petrobot.coordinator.analysis.time.task_forecast import (
+    MATTERS,
+    SAME,
+    TIME,
+    rough_fits,
+    timer_shares,
+)
 from petrobot.coordinator.analysis.time.whatif import (
     Change,
     change_gspn,
@@ -55,6 +63,8 @@ from petrobot.coordinator.task.wording import wrapped
 from petrobot.services.host.whole_file import write_whole
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
+SURE = 1e-4
+"""Probability below which chance does not explain a difference from played missions."""
 SEARCHED = 0.5
 """Share of the seconds of an analysis that its searches may use; the rest is for the verdicts."""
 UNFINISHED = (
@@ -160,6 +170,8 @@ def analyse_command(
             if expressions:
                 data["measures"], lines = _tell_measures(expressions, analyses)
                 said += lines
+            times = ["time(0.9)"] * bool(wanted) + [one.text for one in expressions]
+            notes += _unlike_missions(" ".join(times), analyses)
     except (NetFileError, ValueError, OverflowError) as error:
         return _refused(path, error)
     except OutOfTime as late:  # the input is good, and the answer is not known
@@ -215,6 +227,37 @@ def _tell_measures(
         for name, values in rows.items()
     ]
     return {name: values[-1] for name, values in rows.items()}, ["", "measures:", *lines]
+
+
+def _unlike_missions(text: str, analyses: Sequence[Analysis]) -> tuple[str, ...]:
+    """Return, as a note, which `late(S)` and `time(Q)` of a text missions with exact times have
+    otherwise: by more than MATTERS, and than chance explains."""
+    off = dict[str, None]()
+    for call, word, argument in re.findall(r"((time|late)\(\s*([^()]*?)\s*\))", text):
+        for one in analyses:
+            if one.forecast is not None and one.missions is not None and one.missions.times:
+                with suppress(OutOfTime):
+                    value = value_of(UserMeasure(call, call), one.forecast)
+                    there, chance = _played(one.missions, word, float(argument), value)
+                    if abs(value - there) > MATTERS * abs(there) and chance < SURE:
+                        off[f"{call} is {value:.6g} here, {there:.6g} there"] = None
+    told = f"doubtful, as durations have few phases: missions with exact times: {'; '.join(off)}"
+    return (told,) * bool(off)
+
+
+def _played(plays: MissionFigures, word: str, given: float, value: float) -> tuple[float, float]:
+    """Return `time(given)` or `late(given)` of played missions, and the probability that as few or
+    as many of them are below it, or late, if `value` is right."""
+    from scipy.special import bdtr, bdtrc  # here: most commands have none of these numbers
+
+    times, n = np.sort(plays.times), plays.missions
+    if word == "time":
+        n, share, there = len(times), given, float(np.quantile(times, given))
+        count = int(np.searchsorted(times, value))
+    else:
+        share, count = value, n - int(np.searchsorted(times, given * (1 + SAME), "right"))
+        there = count / n
+    return there, min(bdtr(count, n, share), bdtrc(count - 1, n, share) if count else 1.0)
 
 
 def _measure_values(measure: UserMeasure, analyses: Sequence[Analysis]) -> list[float]:

@@ -36,7 +36,7 @@ from petrobot.coordinator.analysis.net.deadlocks import (
 from petrobot.coordinator.analysis.net.ends_net import EndsNet, ends_net, judged, proven
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.space import INTERRUPTED, SearchLimits, Space, explore
+from petrobot.coordinator.analysis.net.space import INTERRUPTED, LOOK, SearchLimits, Space, explore
 from petrobot.coordinator.analysis.net.structure import (
     Lyapunov,
     Semiflows,
@@ -188,6 +188,8 @@ class Analysis:
     exact: MissionFigures | None = None
     """Figures of missions with exact times, if those of `forecast` are doubtful because of its few
     phases."""
+    missions: MissionFigures | None = None
+    """Missions with exact times, if some could be played."""
     refused: bool = False
     """Whether the task may not run for a reason beyond these verdicts (`may_run`)."""
     fewer: Mapping[int, Analysis] = field(default_factory=dict)
@@ -547,8 +549,6 @@ def analyse(
     )
 
 
-LOOK = 10_000
-"""Markings after which boundedness is checked, before the search continues to its limits."""
 ENDLESS = "the net is unbounded"
 FULL = (
     "the memory was used up: what was found by then holds, the rest is unknown; give more --memory"
@@ -732,11 +732,11 @@ def with_forecast(
     """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
     without searching again."""
     notes, doubts = list(found.notes), list[str]()
-    numbers = exact = None
+    numbers = exact = missions = None
     try:
         numbers = _forecast(task, measured, stages, limits, notes, devices)
         if numbers is not None:
-            doubts, exact = _doubts(
+            doubts, exact, missions = _doubts(
                 numbers, found.progress, measured, stages, limits, notes, devices
             )
     except KeyboardInterrupt:
@@ -748,6 +748,7 @@ def with_forecast(
         interrupted=CUT in notes,
         doubts=tuple(doubts),
         exact=exact,
+        missions=missions,
     )
 
 
@@ -790,17 +791,18 @@ def _doubts(
     limits: SearchLimits | None,
     notes: list[str],
     devices: Mapping[str, str] | None,
-) -> tuple[list[str], MissionFigures | None]:
+) -> tuple[list[str], MissionFigures | None, MissionFigures | None]:
     """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
     everything but durations, and with missions played on it, whose durations are not divided into
-    phases. Return which figures differ and what only one side assumes, and the figures of those
-    missions if they are among them; add a note where one of the two comparisons cannot be made.
+    phases. Return which figures differ and what only one side assumes, those missions if they are
+    among them, and those missions in any case; add a note where one of the two comparisons cannot
+    be made.
     """
     doubts, failed = list(found.view.doubts), dict[str, str]()
-    exact = list[MissionFigures]()
+    exact, missions = list[MissionFigures](), list[MissionFigures]()
     there: Mapping[str, Callable[[Progress], list[str]]] = {
         "the execution graph": partial(_as_chain, found, measured, stages, limits, devices),
-        "missions with exact times": partial(_as_played, found, measured, stages, exact),
+        "missions with exact times": partial(_as_played, found, measured, stages, exact, missions),
     }
     for what, compared in there.items():
         try:
@@ -812,7 +814,7 @@ def _doubts(
                 raise KeyboardInterrupt from why
             failed.setdefault(_why(why), what)
     notes += [f"the forecast was not compared with {there}: {why}" for why, there in failed.items()]
-    return doubts, next(iter(exact), None)
+    return doubts, next(iter(exact), None), next(iter(missions), None)
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:
@@ -864,12 +866,15 @@ def _as_played(
     measured: Measured | None,
     stages: int,
     exact: list[MissionFigures],
+    missions: list[MissionFigures],
     progress: Progress,
 ) -> list[str]:
     """Return which figures missions with exact times have otherwise, if by more than MATTERS and
     five standard errors, and the execution graph as a chain does not tell them right either: what
-    phases do. Then append those missions to `exact`. Raises NoEstimate, TooLarge and OutOfTime."""
+    phases do. Then append those missions to `exact`, and in any case to `missions`. Raises
+    NoEstimate, TooLarge and OutOfTime."""
     plays, off, chain = played(progress.x, measured), list[str](), progress.chain
+    missions.append(plays)
     for name, value in found.figures.items():
         mean, error = plays.figures[name]
         if 0 < value < 1 and name != TIME:  # a share near 1 may have no miss in so few missions
@@ -1080,9 +1085,10 @@ def _recovery_row(name: str, r: Recovery, odds: Odds) -> list[str]:
         "-" if r.lost is None else " to ".join(str(n) for n in dict.fromkeys(r.lost)),
     )
     line = name + _columns((*row, path))
+    why = [line for text in r.possible.details for line in wrapped(f"{'':8}{text}", 12).split("\n")]
     if len(line) <= COLUMNS:
-        return [line]
-    return [name + _columns((*row, "")), f"{'':8}way back: {path}"]
+        return [line, *why]
+    return [name + _columns((*row, "")), f"{'':8}way back: {path}", *why]
 
 
 def _probability(p: float) -> str:

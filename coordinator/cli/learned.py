@@ -80,7 +80,9 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
             "C_interval": _interval(p.cost),
             "J": _known(p.j),
             "J_interval": list(p.j_bounds) if all(map(isfinite, p.j_bounds)) else None,
-            "declared_costs": dict(task.primitive_tasks[p.primitive_task].costs),
+            "declared_costs": dict(task.primitive_tasks[p.primitive_task].costs)
+            if p.measure == task.primitive_tasks[p.primitive_task].cost
+            else {},
         }
         for p in found.parts.values()
     ]
@@ -97,6 +99,7 @@ def figures(kept: FileContents, name: str, options: argparse.Namespace) -> dict[
         "product": found.product,
         "cost": _known(found.cost.value),
         "cost_interval": _interval(found.cost),
+        "uncosted": list(found.uncosted),
         "rho": found.rho,
         "J": _known(found.j.value),
         "J_interval": _interval(found.j),
@@ -170,8 +173,11 @@ def _declared(costs: dict[str, float]) -> str:
 
 def _why_no_cost(found: dict[str, Any]) -> str:
     measures = {p["measure"] for p in found["primitive_tasks"]}
-    mixed = f"; {', '.join(sorted(measures))} do not add: give --cost" if len(measures) > 1 else ""
-    return mixed if found["cost"] is None else ""
+    if found["cost"] is None and len(measures) > 1:
+        return f"; {', '.join(sorted(measures))} do not add: give --cost"
+    lack = ", ".join(found["uncosted"])
+    part = "" if found["cost"] is None else "left out of its interval and of that of J, "
+    return f"; {part}not known: the cost of {lack}" if lack else ""
 
 
 def _cell(value: float | None, interval: list[float] | None = None) -> str:

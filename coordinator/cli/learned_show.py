@@ -108,9 +108,11 @@ def asked_question(kept: FileContents, task: str, options: argparse.Namespace) -
     target is for all contexts together, not for one."""
     asked = kept.question(task)
     target = asked.target if options.target is None and options.context is None else options.target
+    measure = options.cost or asked.measure
     return replace(
         asked,
-        measure=options.cost or asked.measure,
+        measure=measure,
+        declared=asked.declared if measure == asked.measure else (),
         target=target,
         rho=asked.rho if options.rho is None else options.rho,
     )
@@ -212,6 +214,9 @@ def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[s
         "R_over_all_runs": _number(whole.reliability),
         "A": f.availability,
         "C": _number(f.cost),
+        "C_low": _number(f.cost_lower),
+        "C_high": _number(f.cost_upper),
+        "C_declared": _number(asked.declared_cost(f.action)),
         "C_largest": _number(f.largest_cost),
         "scenario": f.scenario,
         "scenarios": list(f.scenarios),
@@ -265,6 +270,10 @@ def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
                 "R_high": f.upper,
                 "A": f.availability,
                 "C": _number(f.cost),
+                "C_low": _number(f.cost_lower),
+                "C_high": _number(f.cost_upper),
+                "C_declared": _number(asked.declared_cost(action)),
+                "cost_mean": _number(tally.cost(asked.measure).mean),
                 "J": _number(f.j),
                 "J_low": _number(f.j_lower),
                 "J_high": _number(f.j_upper),
@@ -364,6 +373,7 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     table.show_edge = table.pad_edge = False
     always_there = all(row["A"] == 1.0 for row in about["actions"])
     several = any(row["source"] for row in about["actions"])
+    declared = any(row["C_declared"] is not None for row in about["actions"])
     columns = [
         "action",
         "runs",
@@ -371,6 +381,8 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
         "R",
         "R 95 %",
         "C",
+        "C 95 %",
+        *(["C declared"] if declared else []),
         "J",
         "J 95 %",
         "s p50/p90",
@@ -383,26 +395,35 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
         own = row["source"] == about["source"]
         clear = own and row["action"] == about["best"] and about["clear"]
         name = row["action"] + (" *" if clear else "")
-        table.add_row(*_cells(name, row, several)[: len(columns)])
+        table.add_row(*_cells(name, row, several, declared)[: len(columns)])
         if own and len(about["contexts"]) > 1:
             for part in about["by_context"]:
                 if part["action"] == row["action"]:
-                    cells = _cells(f"  {_named(part['context'])}", part, several)
+                    cells = _cells(f"  {_named(part['context'])}", part, several, declared)
                     table.add_row(*cells[: len(columns)])
     print_table(console, table)
     for line in [*_warnings(about), *_remarks(about, options)]:
         console.print(f"  {line}", highlight=False)
 
 
-def _cells(name: str, row: Mapping[str, Any], several: bool) -> list[str]:
+def _cells(name: str, row: Mapping[str, Any], several: bool, declared: bool) -> list[str]:
     times = f"{_cell(row['seconds_p50'])}/{_cell(row['seconds_p90'])}"
     cpu = None if row["cpu_mean"] is None else 1e3 * row["cpu_mean"]
     interval = f"{row['R_low']:.2f}-{row['R_high']:.2f}"
     known = row["J_low"] is not None and row["J_high"] is not None
     of_j = f"{row['J_low']:.2f}-{row['J_high']:.2f}" if known else None
-    numbers = [row["R"], interval, row["C"], row["J"], of_j, times, cpu, row["A"]]
+    costs = [row["C"], _of_cost(row), *([row["C_declared"]] if declared else [])]
+    numbers = [row["R"], interval, *costs, row["J"], of_j, times, cpu, row["A"]]
     source = [row.get("source", "") or ("-" if "source" in row else "")] if several else []
     return [name, str(row["runs"]), *source, *map(_cell, numbers)]
+
+
+def _of_cost(row: Mapping[str, Any]) -> str | None:
+    """Return the interval of C; that it is declared, if no run reported a cost."""
+    if row["cost_mean"] is None:
+        return None if row["C"] is None else "declared"
+    known = row["C_low"] is not None and row["C_high"] is not None
+    return f"{_cell(row['C_low'])}-{_cell(row['C_high'])}" if known else None
 
 
 def _cell(value: Any) -> str:

@@ -33,6 +33,8 @@ SHIPPED_CELL = (Path(__file__).parents[2] / "services.toml").resolve()
 """The location file that comes with petrobot: that of the catching cell."""
 UNKNOWN = "unknown"
 """Plant of runs in files that were written before plants were stored."""
+ESTIMATES = Path("estimates")
+"""Folder of the estimates files of runs that the operator's page starts."""
 OWN = Path("tasks")
 """Folder of the user's own tasks; the operator's page saves there."""
 SLOW = 2.0

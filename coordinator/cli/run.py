@@ -378,7 +378,7 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
     try:
         async with local_nodes(directory, mock=options.mock) if options.up else nullcontext():
             await session.connect()
-            async with _page(session, options):
+            async with served(session, options):
                 with progress(options) as watch:
                     await session.lead(watch)
     finally:
@@ -386,10 +386,10 @@ async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> No
 
 
 @asynccontextmanager
-async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterator[None]:
+async def served(session: RunSession, options: argparse.Namespace) -> AsyncIterator[None]:
     """Serve the operator's page, or with --no-page the operator's protocol alone, while the run is
     active."""
-    from petrobot.coordinator.cli.loading import SHIPPED, own_tasks
+    from petrobot.coordinator.cli.loading import ESTIMATES, SHIPPED, own_tasks
     from petrobot.coordinator.operator.run_address import RunAddress
     from petrobot.coordinator.operator.station import offered
     from petrobot.coordinator.page.server import start_page
@@ -408,6 +408,8 @@ async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterat
             ),
             runs=session.folder.parent,
             services=directory.source,
+            estimates=session.estimates or ESTIMATES,
+            plant=session.plant,
             page=not options.no_page,
         )
     if not options.no_page:

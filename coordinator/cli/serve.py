@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    ESTIMATES,
     SHIPPED,
     add_dry_run_argument,
     add_services_argument,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot serve --up"
-ESTIMATES = Path("estimates")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,6 +135,7 @@ async def _page(
             starts=station.form,
             services=station.directory.source,
             estimates=options.estimates,
+            plant=station.directory.plant(scripted=options.mock is not None, lockstep=False),
         )
     station.address = _addresses(station.directory, page)
     try:

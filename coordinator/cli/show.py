@@ -170,9 +170,15 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     if not shares:
         raise CommandError(2, f"{task.name}: no heat: no action takes time")
     most = max(shares, key=lambda place: shares[place])
+    # All sources would make the line of the legend too long.
+    sources = view.numbers.items()
+    own = [s for s, names in sources if any(name.startswith(f"{most}.") for name in names)]
+    count = {source: len(names) for source, names in sources}
+    measured = sum(n for source, n in count.items() if source.startswith("measured"))
     told = (
         f"Warm: share of the mean time by the forecast; the bottleneck is {most} with "
-        f"{100 * shares[most]:.0f} %. Assumed: {assumed(cell)}."
+        f"{100 * shares[most]:.0f} % ({'; '.join(own)}). {measured} of {sum(count.values())} "
+        f"numbers are measured. Assumed: {assumed(cell)}."
     )
     return Overlay(heat=shares, legend=told)
 

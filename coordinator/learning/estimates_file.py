@@ -26,6 +26,7 @@ from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
     CAMPAIGN,
     CHOICE,
+    COSTS,
     COUNTED,
     FLOWS,
     IN,
@@ -190,11 +191,11 @@ class EstimatesFile:
             if name.startswith(PRIOR):
                 trials, _, of = value.partition(" ")
                 kept.priors[name.removeprefix(PRIOR)] = (of, float(trials))
-        for _, task, _, *asked in sorted(
+        for origin, task, _, *asked in sorted(
             questions(db), key=lambda row: (row[0] != kept.origin, -row[2], row[0])
         ):
             known = kept.asked.get(task, ())
-            question = question_of(asked)
+            question = question_of(asked, about.get(f"{COSTS}{origin} {task}", ""))
             kept.asked[task] = known if question in known else (*known, question)
         return kept
 
@@ -388,8 +389,10 @@ class EstimatesFile:
             for table in SUMS:
                 for row in rows[table.name]:
                     table.read(row)
-            for _, _, _, *asked in rows["question"]:
-                question_of(asked)
+            costs = {}
+            for own, task, _, *asked in rows["question"]:
+                costs[own, task] = fact(db, f"{COSTS}{own} {task}")
+                question_of(asked, costs[own, task])
             states = [(task, name, state_of(body)) for task, name, body in selectors]
         with self._writing() as mine:
             if simulated:
@@ -401,6 +404,8 @@ class EstimatesFile:
             for task, name, state in states:
                 take_selector(mine, task, name, state, origin)
             mine.executemany("INSERT OR IGNORE INTO forgotten VALUES (?, ?)", gone)
+            for own, task, *_ in {*rows["question"]} & {*questions(mine)}:
+                put_fact(mine, f"{COSTS}{own} {task}", costs[own, task] or "[]")
             forget(mine)
 
     # --- the database -------------------------------------------------------------------------

@@ -71,6 +71,9 @@ APPLICATION = 0x70657472
 CHOICE = "choice of "
 """Prefix of a primitive task's name in the table `forgotten`: only the states of its selectors are
 forgotten, not its estimates."""
+COSTS = "declared costs of "
+"""Prefix of an origin and a primitive task in the table `about`; the value is what the task file
+declared as the costs of actions, as JSON."""
 COUNTED = "counted "
 """Prefix of a mission run's id in the table `about`: the origin under which its runs were counted
 when it was interrupted."""
@@ -299,6 +302,7 @@ def put_question(
     """Store by what an origin judges the actions of a primitive task."""
     row = (origin, task, version, asked.measure, asked.target, asked.rho)
     db.execute("INSERT OR REPLACE INTO question VALUES (?, ?, ?, ?, ?, ?)", row)
+    put_fact(db, f"{COSTS}{origin} {task}", json.dumps(asked.declared))
 
 
 def questions(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
@@ -306,15 +310,16 @@ def questions(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
     return db.execute("SELECT * FROM question").fetchall() if schema(db) > 1 else []
 
 
-def question_of(row: Sequence[Any]) -> Question:
-    """Read cost, target and rho. Raises ValueError."""
+def question_of(row: Sequence[Any], costs: str = "") -> Question:
+    """Read cost, target and rho; `costs`: the declared ones as JSON. Raises ValueError."""
     cost, target, rho = row
     Tally().cost(cost)
     if target is not None and not 0 < target <= 1:
         raise ValueError(f"target: expected a reliability above 0 and up to 1, got {target!r}")
     if rho is not None and not 0 <= rho < inf:
         raise ValueError(f"rho: expected a number from 0, got {rho!r}")
-    return Question(cost, target, rho)
+    declared = tuple((str(action), float(c)) for action, c in json.loads(costs or "[]"))
+    return Question(cost, target, rho, declared=declared)
 
 
 def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any], name: str) -> None:

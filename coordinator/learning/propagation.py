@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from math import inf, isnan, log, nan, prod, sqrt
 from pathlib import Path
 from typing import Any
@@ -32,11 +32,12 @@ from petrobot.coordinator.analysis.time.stochastic import stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.estimate import CENSORED, Tally
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare, objective
 from petrobot.coordinator.learning.statistics import added, joined, objective_interval
-from petrobot.coordinator.task import Estimate, Executed, Kind, Status, Task
+from petrobot.coordinator.task import Estimate, Executed, Kind, PrimitiveTask, Status, Task
+from petrobot.services.comm.location_file import DRY_RUN, MOCK
 
 # --- competing risks ---
 
@@ -98,26 +99,53 @@ def incidences(times: Sequence[float], causes: Sequence[str | None]) -> dict[str
 
 
 ChoiceShares = Mapping[str, Mapping[str, float]]
+Visits = Mapping[tuple[str, str], float]
+"""Expected runs of each (place, action) in a mission run."""
 
 
 # --- estimates into the stochastic view ---
 
 
 def newest_measured(
-    folder: str, task: Task, devices: Mapping[str, str] | None
+    estimates: str, task: Task, devices: Mapping[str, str] | None, plant: str = ""
 ) -> tuple[Measured, str]:
-    """Return what the newest estimates file of a folder in which something of the task was measured
-    says, and where this is from in words; nothing and an empty text if there is none. Files that
-    cannot be read are left out."""
-    files = [file for file in Path(folder).glob("*.db") if file.is_file()] if folder else []
-    for file in sorted(files, key=lambda file: -file.stat().st_mtime):
-        with suppress(EstimatesError):
-            kept = EstimatesFile(file).read()
-            found = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
-            if found.runs:
-                plant = f"plant {kept.plant or 'unknown'}"
-                return found, f"numbers as measured in {file} ({plant}), else as declared"
+    """Return what was measured of a task, and where this is from in words; nothing and an empty
+    text if nothing was. `estimates` is a folder of estimates files, or one of them.
+
+    Measurements of `plant` come first, then those of a real cell, a simulated one, and one that is
+    not known; of the same, those of the newest file. Those with scripted actions or without drives
+    count only for their own plant. Files that cannot be read are left out."""
+    given = Path(estimates)
+    found: list[tuple[tuple[bool, int, int], Path, FileContents]] = []
+    for file in (given.glob("*.db") if given.is_dir() else [given]) if estimates else []:
+        with suppress(EstimatesError, OSError):
+            stamp = _stamp(file)
+            for name in _contents(file, stamp, None).plants:
+                kept = _contents(file, stamp, name)
+                if name == plant or name.partition(" ")[0] not in (MOCK, DRY_RUN):
+                    found.append(((name != plant, kept.rank(name)[0], -max(stamp)[0]), file, kept))
+    for _, file, kept in sorted(found, key=lambda entry: entry[0]):
+        measured = measured_from(task, kept.estimates, kinds=kept.kinds, devices=devices)
+        if measured.runs:
+            of = f"plant {kept.plant or 'unknown'}"
+            of += f", nothing of {plant}" if plant and kept.plant != plant else ""
+            return measured, f"numbers as measured in {file} ({of}), else as declared"
     return Measured(), ""
+
+
+def _stamp(file: Path) -> tuple[tuple[int, int], ...]:
+    """Return (time, size) of an estimates file and of its log, to which SQLite writes first. Raises
+    OSError."""
+    of = [file.stat()]
+    with suppress(FileNotFoundError):
+        of.append(Path(f"{file}-wal").stat())
+    return tuple((s.st_mtime_ns, s.st_size) for s in of if s.st_size)
+
+
+@lru_cache(maxsize=64)
+def _contents(file: Path, stamp: object, plant: str | None) -> FileContents:
+    """Read a file again only when its `stamp` has changed. Raises EstimatesError."""
+    return EstimatesFile(file).read(plant)
 
 
 def measured_from(
@@ -464,6 +492,8 @@ class Propagated:
     product: float
     """Product of R over the primitive tasks that every mission run contains; equal to R_conj if the
     they run in series."""
+    uncosted: tuple[str, ...] = ()
+    """Actions of unknown cost: without it C is unknown if they run, else its interval lacks it."""
 
     @property
     def conjunctive(self) -> float:
@@ -564,10 +594,17 @@ def _figures(
             parts[name] = part[0]
             costs |= {(place, a): c for place in places for a, c in part[1].items()}
     needed = [p for p in parts.values() if p.runs > 0]
-    alike = len({p.measure for p in needed}) == 1
+    run = {task.primitive_task_of(place).name for (place, _), n in found.visits.items() if n > 0}
+    alike = len({asked[name].measure for name in run}) == 1
     largest = added(p.runs * p.largest_cost for p in needed) if alike else nan
+    for (place, action), n in found.visits.items():
+        primitive = task.primitive_task_of(place)
+        given = _declared_cost(primitive, action, asked[primitive.name])
+        if (place, action) not in costs and not isnan(given):
+            costs[place, action] = Uncertain(given, given, given)
+            largest += n * given
     weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
-    moves = _moves(task, estimates, found, scenario, costs if alike else {}, asked, scenarios)
+    moves, ran = _moves(task, estimates, found, scenario, costs, asked, scenarios)
     r = found.solved.conjunctive_reliability
     c = _total(found.visits, costs) if alike else nan
     of_r = [(-min(m.low_r, m.high_r), max(m.low_r, m.high_r)) for m in moves.values()]
@@ -589,7 +626,17 @@ def _figures(
         if c == c
         else UNKNOWN,
         prod(p.reliability.value for p in needed),
+        tuple(sorted({action for _, action in ran - {*costs}})) if alike else (),
     )
+
+
+def _declared_cost(primitive: PrimitiveTask, action: str, asked: Question) -> float:
+    """Return what a run costs by the task file, where none was measured: its declared cost, or if
+    the cost is its time, its declared duration; nan if neither is known."""
+    cost = asked.declared_cost(action)
+    if isnan(cost) and asked.measure == "wall" and primitive.estimates:
+        return added(e.share * e.mean for e in primitive.estimates.values())
+    return cost
 
 
 def _of_j(
@@ -617,9 +664,7 @@ def _span(one: float, other: float) -> tuple[float, float]:
     return max(0.0, -one, -other), max(0.0, one, other)
 
 
-def _total(
-    visits: Mapping[tuple[str, str], float], costs: Mapping[tuple[str, str], Uncertain]
-) -> float:
+def _total(visits: Visits, costs: Mapping[tuple[str, str], Uncertain]) -> float:
     """Return the expected cost of a mission run; nan if an action that it runs has none."""
     return added(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
 
@@ -649,13 +694,15 @@ def _moves(
     costs: Mapping[tuple[str, str], Uncertain],
     asked: Mapping[str, Question],
     scenarios: int,
-) -> dict[tuple[str, str], _Move]:
-    """Return the move of each (place, action), for the hardest of so many scenarios.
+) -> tuple[dict[tuple[str, str], _Move], set[tuple[str, str]]]:
+    """Return the move of each (place, action), for the hardest of so many scenarios, and which of
+    them run in any of the solutions.
 
     To first order: one more solution for each action, with its share of SUCCESS changed by STEP.
+    What has no cost is left out.
     """
-    out = {}
-    r, c = found.solved.conjunctive_reliability, _total(found.visits, costs)
+    out, run = {}, {key for key, n in found.visits.items() if n > 0}
+    r, c = found.solved.conjunctive_reliability, _known_total(found.visits, costs)
     for (place, action), known in found.measured.runs.items():
         primitive = task.primitive_task_of(place).name
         tally = reduce(
@@ -668,14 +715,19 @@ def _moves(
         runs = {**found.measured.runs, (place, action): _shifted(known, step)}
         other = _solve(task, replace(found.measured, runs=runs))
         slope_r = (other.solved.conjunctive_reliability - r) / step
-        slope_c = (_total(other.visits, costs) - c) / step if c == c else 0.0
+        slope_c = (_known_total(other.visits, costs) - c) / step
+        run |= {key for key, n in other.visits.items() if n > 0}
         level = 1.0 - (1.0 - asked[primitive].level) / scenarios
         low, high = (bound - tally.reliability for bound in tally.interval(level))
         joint = tally.cost_correlation(asked[primitive].measure)
         out[place, action] = _Move(
             low * slope_r, low * slope_c, high * slope_r, high * slope_c, joint
         )
-    return out
+    return out, run
+
+
+def _known_total(visits: Visits, costs: Mapping[tuple[str, str], Uncertain]) -> float:
+    return _total({key: n for key, n in visits.items() if key in costs}, costs)
 
 
 def _shifted(known: Mapping[Status, Estimate], step: float) -> dict[Status, Estimate]:

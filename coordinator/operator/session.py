@@ -103,6 +103,11 @@ class RunSession(ABC):
         self._begun = time.perf_counter()
         self._seconds = 0.0
 
+    @property
+    def estimates(self) -> Path | None:
+        """The estimates file from which it learns; None if it does not learn."""
+        return None if self._learning is None else self._learning.setting.path
+
     def operate(
         self,
         feed: Feed | None = None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import OrderedDict
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,8 @@ class PageState:
     starts: StartForm | None = None
     services: str = ""
     """The path of the location file; empty if only `offers` are known."""
-    estimates: str = ""
-    """The folder of estimates files; empty if there is none."""
+    numbers: Mapping[str, str] = field(default_factory=dict)
+    """What `newest_measured` needs: `estimates` and the `plant` of the page."""
     limit: ConnectionLimit | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)

@@ -93,7 +93,7 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
     try:
         text = json.loads(await page_state.apart.do("drawing", drawing))["text"]
         given = {"text": text, "filename": f"{drawing['name']}.toml", **_known(page_state)}
-        given["estimates"] = page_state.estimates
+        given |= page_state.numbers
         said = await page_state.analyses.do("analysis", given, _desk(body))
     except RefusedError as refusal:
         return _refusal(refusal)
@@ -103,7 +103,7 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
 async def _export(request: web.Request) -> web.Response:
     name, form = request.match_info["name"], request.match_info["form"]
     page_state = request.app[PAGE_STATE]
-    given = {**_file(request), "form": form, "estimates": page_state.estimates}
+    given = {**_file(request), "form": form, **page_state.numbers}
     try:
         made = json.loads(await page_state.apart.do("export", given))
     except RefusedError as refusal:

@@ -84,6 +84,7 @@ async def start_page(
     starts: StartForm | None = None,
     services: Path | None = None,
     estimates: Path | None = None,
+    plant: str = "",
     page: bool = True,
 ) -> Page:
     """Serve the page of a mission; without `page`, only the operator protocol: WebSocket, snapshot
@@ -91,8 +92,9 @@ async def start_page(
 
     Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and saving one makes a
     copy there. `services` is the location file of the cell, whose code the check reads. `runs` has
-    a folder for each recorded run, `estimates` the files whose numbers forecasts take. `port` 0
-    selects a free one. `token` is random unless given. Raises OSError if the port is in use."""
+    a folder for each recorded run. Forecasts take the numbers of `estimates`, a folder of estimates
+    files or one of them, first those of `plant`. `port` 0 selects a free one. `token` is random
+    unless given. Raises OSError if the port is in use."""
     # It listens at once: until then, another process could still take the port.
     listener = sockets.create_server((HOST, port), backlog=128)
     number = listener.getsockname()[1]
@@ -105,7 +107,7 @@ async def start_page(
         runs,
         starts,
         str(services.resolve()) if services else "",
-        str(estimates) if estimates else "",
+        {"estimates": str(estimates or ""), "plant": plant},
     )
     runner = web.AppRunner(
         _application(page_state, page),

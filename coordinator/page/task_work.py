@@ -123,9 +123,11 @@ def load(text: str, filename: str) -> Task:
         raise FormatError(str(error)) from error
 
 
-def export(text: str, filename: str, form: str, cell: Fields, estimates: str = "") -> ConvertedTask:
-    """Return the task in another format; `gspn.svg` draws its stochastic view, with the numbers of
-    the newest estimates file in the folder `estimates`. Raises FormatError."""
+def export(
+    text: str, filename: str, form: str, cell: Fields, estimates: str = "", plant: str = ""
+) -> ConvertedTask:
+    """Return the task in another format; `gspn.svg` draws its stochastic view, with the numbers
+    that `newest_measured` finds. Raises FormatError."""
     task = load(text, filename)
     if form == "toml":
         return ConvertedTask(dumps(task), "application/toml")
@@ -142,7 +144,7 @@ def export(text: str, filename: str, form: str, cell: Fields, estimates: str = "
         known = None if cell is None else Cell(**cell)
         devices = devices_of(known)
         try:
-            measured, source = newest_measured(estimates, task, devices)
+            measured, source = newest_measured(estimates, task, devices, plant)
             view = stochastic_view(task, measured, devices=devices)
         except ValueError as fault:
             raise FormatError(f"no stochastic view: {fault}") from fault
@@ -241,11 +243,11 @@ def _check(cell: Fields, services: str, name: str, **drawing: Any) -> dict[str, 
 
 
 def _export(
-    tasks: str, shipped: str, name: str, form: str, cell: Fields, estimates: str
+    tasks: str, shipped: str, name: str, form: str, cell: Fields, estimates: str, plant: str
 ) -> dict[str, Any]:
     try:
         task = _store(tasks, shipped).read(name)
-        made = export(task.text, f"{task.name}.toml", form, cell, estimates)
+        made = export(task.text, f"{task.name}.toml", form, cell, estimates, plant)
     except StoreError as fault:
         raise _refused(fault) from fault
     except FormatError as fault:

@@ -329,6 +329,13 @@ def test_poisson_weights(mean: float) -> None:
         assert weight[k - low] == pytest.approx(exp(-mean) * mean**k / factorial(k), rel=1e-9)
 
 
+def test_an_unbounded_net_is_not_searched_to_the_limits() -> None:
+    """The message names the place that grows, not a limit of time."""
+    net = Net.build({"p": 1, "bin": 0}, {"t": ({"p": 1}, {"p": 1, "bin": 1})})
+    with pytest.raises(ValueError, match="but bin can grow without bound; simulate instead"):
+        Chain.of(Gspn.of(net, {"t": 1.0}))
+
+
 def test_invalid_gspns_are_refused_with_a_reason() -> None:
     with pytest.raises(ValueError, match="not a transition"):
         Gspn.of(queue(2), {"nobody": 1.0})

@@ -867,6 +867,46 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     assert "because `ask` takes it first" in found.reason
 
 
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_counter_that_nothing_resets_is_why_there_is_no_way_back(reset: bool) -> None:
+    """The work is back after `fixed`, but the third error will be the last one."""
+    net: dict[str, dict[str, Any]] = {
+        "ok": {"in": "a:normal", "out": "done"},
+        "bad": {"in": "a:error", "out": "fix failures"},
+        "fixed": {"in": "fix:normal", "out": "a"},
+        "not_fixed": {"in": "fix:error", "out": "fix failures"},
+        "give_up": {"in": "fix:error failures*3", "out": "lost", "priority": 1},
+        "give_up_too": {"in": "a:error failures*3", "out": "lost", "priority": 1},
+    }
+    if reset:
+        net["forget"] = {"in": "failures a:going", "priority": 2}
+    task = make_task("a!=1 fix! failures done lost", net, final="done == 1")
+    found = {r.name: r for r in judged(replace(task, final_error=parse("lost == 1"))).recoveries}
+    told = (
+        "failures counts as an error that remains: an error branch fills it, and nothing empties "
+        "it unless the task gives up"
+    )
+    assert (found["bad"].kappa == -1) is not reset
+    assert (told in found["bad"].possible.details) is not reset
+    assert not found["give_up"].possible.details
+
+
+def test_what_a_winner_took_is_told_where_others_can_fill_the_place() -> None:
+    """`quick` has priority over the task's own way to its end."""
+    net: dict[str, dict[str, Any]] = {
+        "made": {"in": "make:normal", "out": "part go"},
+        "unmade": {"in": "make:error", "out": "part go"},
+        "begin": {"in": "go", "out": "look"},
+        "quick": {"in": "part", "out": "bin", "priority": 1},
+        "seen": {"in": "part look:normal", "out": "done"},
+        "unseen": {"in": "look:error", "out": "look"},
+    }
+    found = judged(
+        make_task("make!=1 look! go part bin done", net, final="done == 1")
+    ).deadlock_free
+    assert found.details[0] == "part: taken by `quick`; only `made`, `unmade` can fill it"
+
+
 def test_a_transition_that_never_fires_names_who_takes_its_runs_first() -> None:
     net = {**SORTING, "tired": {"in": "park:normal", "out": "broken arm", "priority": 2}}
     final, end = "parts == 0 and arm == 1", parse("broken == 1")

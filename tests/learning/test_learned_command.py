@@ -98,7 +98,7 @@ def _uses_the_measurements(file: str, capsys: pytest.CaptureFixture[str]) -> Non
     ):
         assert main(command) in (0, 1)
         said = capsys.readouterr().out
-        assert "measured in" in said or "--view" not in command
+        assert "measured in" in said or command[0] != "show"
     assert main(["analyse", "catch_ball", *more]) == 2
     assert "nothing was measured of catch_ball" in capsys.readouterr().err
 
@@ -442,6 +442,28 @@ def test_a_run_warns_that_a_cost_was_never_reported(
         == 0
     )
     assert "place: no run of place_soft reported value:trees" in capsys.readouterr().err
+
+
+def test_a_declared_cost_counts_until_one_is_measured_and_stands_beside_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also in a file that another one was merged into; only for the measure it was declared in."""
+    asked = Question("value:euro", declared=(("one", 2.0), ("two", 5.0)))
+    paid = [Observation(Status.SUCCESS, 1.0, values={"euro": x}) for x in (3.0, 4.0, 5.0)]
+    given = file_of(tmp_path / "x.db", asked, one=shares(1.0, A=(3, 1)), two={"A": tally_of(paid)})
+    merged = tmp_path / "y.db"
+    EstimatesFile(merged).merge(given)
+    for path in (given, merged):
+        shown, text = told(path, capsys)
+        rows = {row["action"]: row for row in shown["pick"]["actions"]}
+        assert [(rows[a]["C"], rows[a]["C_declared"]) for a in ("one", "two")] == [(2, 2), (4, 5)]
+        assert rows["two"]["C_low"] == pytest.approx(4 - 4.302653 / 3**0.5, abs=1e-4)
+        assert shown["pick"]["rho"] == 0.25 and rows["one"]["J"] == pytest.approx(0.25 + 0.5)
+        assert "C declared" in text and "2 declared 2" in text and "4 1.52-6.48 5" in text
+        assert not shown["pick"]["uncosted"]
+    shown, text = told(given, capsys, "--cost", "wall")
+    assert "declared" not in text
+    assert all(row["C_declared"] is None for row in shown["pick"]["actions"])
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ cause, and the sorting task."""
 from __future__ import annotations
 
 from dataclasses import replace
-from math import exp, hypot, sqrt
+from math import exp, hypot, isnan, sqrt
 
 import numpy as np
 import pytest
@@ -177,6 +177,65 @@ def test_intervals_of_the_task_come_from_those_of_its_actions() -> None:
     cheap = propagate(series(2), estimates, rho=0.0)
     assert cheap.j.value == pytest.approx(1 - r1 * r2)
     assert cheap.j.upper == pytest.approx(1 - cheap.reliability.lower, abs=1e-6)
+
+
+RECOVERY = """
+[primitive_tasks.a]
+goal = "a"
+alternatives = ["do_a"]
+deadline = 10.0
+cost = "COST"
+[primitive_tasks.mend]
+goal = "mend"
+alternatives = ["mend"]
+deadline = 10.0
+cost = "COST"
+estimates = { success = { share = 1.0, mean = 3.0 } }
+costs = { DECLARED }
+[places.a]
+kind = "action"
+[places.mend]
+kind = "action"
+[transitions.done]
+in = ["a:normal"]
+out = ["free"]
+[transitions.failed]
+in = ["a:error"]
+out = ["mend"]
+[transitions.mended]
+in = ["mend:normal"]
+out = ["free"]
+"""
+
+
+@pytest.mark.parametrize("errors", [0, 5])
+@pytest.mark.parametrize(
+    ("cost", "declared", "of_mend"),
+    [("wall", "", 3.0), ("wall", "mend = 7.0", 7.0), ("count", "mend = 7.0", 7.0),
+     ("count", "", None)],
+)  # fmt: skip
+def test_a_recovery_that_never_ran_has_its_declared_cost(
+    errors: int, cost: str, declared: str, of_mend: float | None
+) -> None:
+    """Where the cost is time, its declared duration. Without either, C is unknown if the recovery
+    is part of it; else its interval lacks the recovery, and that is said."""
+    text = SERIES + RECOVERY.replace("COST", cost).replace("DECLARED", declared)
+    known = Estimates({TallyKey("a", "do_a"): tally(15, 0, errors, 2.0)})
+    found = propagate(loads(text, "recovery"), known)
+    assert found.uncosted == (() if of_mend is not None else ("mend",))
+    share, own = errors / (15 + errors), 2.0 if cost == "wall" else 1.0
+    if of_mend is None and errors:
+        assert isnan(found.cost.value) and isnan(found.j.value)
+        return
+    assert found.cost.value == pytest.approx(own + share * (of_mend or 0.0))
+    lower, upper = known.of("a")["do_a"][""].interval(0.95)
+    most, least = ((1 - r) * (of_mend or 0.0) for r in (lower, upper))
+    assert found.cost.upper == pytest.approx(own + most, rel=1e-6)
+    assert found.cost.lower == pytest.approx(own + least, rel=1e-6)
+    assert found.j.upper == pytest.approx(
+        found.j.value + found.rho * (most - share * (of_mend or 0.0)) + 1 - share - lower,
+        rel=1e-6,
+    )
 
 
 def test_the_task_is_judged_in_its_hardest_scenario() -> None:

@@ -3,6 +3,7 @@ and journals."""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import os
 import sys
@@ -16,11 +17,14 @@ import pytest_asyncio
 
 from petrobot.coordinator.analysis.formats import pnml
 from petrobot.coordinator.analysis.formats.pnml import parse_pnml
+from petrobot.coordinator.cli import run
 from petrobot.coordinator.cli.loading import own_tasks
 from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.session import LearningSetting
 from petrobot.coordinator.operator import history as journals
+from petrobot.coordinator.operator.prepare import RunRequest, prepare
 from petrobot.coordinator.page import edits
 from petrobot.coordinator.page import task_store as store
 from petrobot.coordinator.page import task_work as verdicts
@@ -247,6 +251,31 @@ async def test_forecasts_take_what_was_learned(stage: Stage, tasks: Path, tmp_pa
                 assert "learned.db" in " ".join((await answer.json())["notes"])
     finally:
         await page.close()
+
+
+async def test_the_page_of_a_run_takes_what_its_plant_learned(tmp_path: Path) -> None:
+    """The page of `petrobot run` takes the file in which the run learns, whatever its name is."""
+    task = ROOT / "coordinator" / "tasks" / "catch_ball.toml"
+    made, file = Estimates(), tmp_path / "lab.estimates"
+    key = TallyKey("locate_ball", "locate_hough", "")
+    made.tallies[key] = Tally().adding(Observation(Status.SUCCESS, 4.0), "t")
+    for plant in ("simulated", "mock"):
+        EstimatesFile(file).add(made, {}, plant=plant)
+    request = RunRequest(learning=LearningSetting(file), folder=tmp_path / "runs")
+    directory = location_file.load(ROOT / "services.toml")
+    session = prepare(request, load(task), task.read_text(encoding="utf-8"), directory)
+    try:
+        async with run.served(session, argparse.Namespace(page_port=0, no_page=False)):
+            assert session.address is not None
+            headers = {"Authorization": f"Bearer {session.address.token}"}
+            async with (
+                aiohttp.ClientSession(session.address.url, headers=headers) as http,
+                http.get("/api/tasks/catch_ball/export/gspn.svg") as answer,
+            ):
+                drawn = await answer.text()
+        assert f"numbers as measured in {file} (plant simulated)" in drawn
+    finally:
+        await session.abandon()
 
 
 async def test_pnml_is_exported_and_imported(http: aiohttp.ClientSession, tasks: Path) -> None:

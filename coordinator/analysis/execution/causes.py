@@ -517,7 +517,9 @@ def _fate(net: Net, draft: Draft, firings: tuple[str, ...], place: int) -> str:
     since, held = _since(net, firings, place), _held(net, draft, firings, place)
     if givers and not (since and (net.initial[place] or held)):
         order = [net.transition_index[name] for name in firings]
-        return f"only {back} can fill it{_elsewhere(net, order, givers)}"
+        elsewhere = _elsewhere(net, order, givers)
+        taken = f"taken by `{net.transitions[since[0]]}`; " if since and not elsewhere else ""
+        return f"{taken}only {back} can fill it{elsewhere}"
     if not since:
         return "nothing ever fills it"
     taker = f"taken by `{net.transitions[since[0]]}`"

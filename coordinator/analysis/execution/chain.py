@@ -253,6 +253,8 @@ class MissionFigures:
     missions: int
     figures: dict[str, tuple[float, float]]
     """Those of `ExecutionChain.figures`, each with its standard error."""
+    times: Sequence[float]
+    """How long those took that reached `final` (s)."""
 
 
 def played(x: ExecutionGraph, measured: Measured | None = None, *, seed: int = 1) -> MissionFigures:
@@ -410,7 +412,8 @@ class _Builder:
             samples |= {GOALS: [met / runs for _, _, met, _ in ended]} if runs else {}
         samples["R_conj"] = [float(final and not spoilt) for final, _, _, spoilt in ended]
         samples[TIME] = [time for final, time, *_ in ended if final]
-        return MissionFigures(len(ended), {name: _mean(some) for name, some in samples.items()})
+        means = {name: _mean(some) for name, some in samples.items()}
+        return MissionFigures(len(ended), means, samples[TIME])
 
     def mission(
         self, random: np.random.Generator, most: int

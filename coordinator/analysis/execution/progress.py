@@ -743,8 +743,28 @@ class Progress:
         whole = Witness(
             (*shown.firings, *step.firings), self.x.marked(target), steps=(*shown.steps, str(step))
         )
-        return PropertyVerdict(
-            False, f"{no} to the nominal flow from {left_over(self.x, target)}", whole
+        reason = f"{no} to the nominal flow from {left_over(self.x, target)}"
+        return PropertyVerdict(False, reason, whole, details=self._never_reset(target))
+
+    def _never_reset(self, target: int) -> tuple[str, ...]:
+        """Return which places of an error branch are marked from a state on, whatever happens,
+        until the task gives up: a counter that nothing resets counts as an error that remains."""
+        x, net = self.x, self.x.engine.compiled.net
+        if x.given_up[target]:
+            return ()
+        row, todo, seen = x.graph.row, [target], {target}
+        kinds = [self.view.task.flat.places[name].kind for name in net.places]
+        kept = {p for p in self.view.error_places if kinds[p] is not Kind.ACTION}
+        while todo and kept:
+            state = todo.pop()
+            kept = {p for p in kept if x.states[state].marking[p]}
+            more = {*x.target[row[state] : row[state + 1]].tolist()} - seen
+            seen |= more
+            todo += [after for after in more if not x.given_up[after]]
+        return tuple(
+            f"{net.places[p]} counts as an error that remains: an error branch fills it, and "
+            "nothing empties it unless the task gives up"
+            for p in sorted(kept)
         )
 
     @cached_property

@@ -191,6 +191,10 @@ class Space:
         return np.concatenate(found)
 
 
+LOOK = 10_000
+"""Markings after which boundedness is checked, before the search continues to its limits."""
+
+
 def explore(
     net: Net, *, engine: EngineName = "auto", limits: SearchLimits | None = None, edges: bool = True
 ) -> Space:

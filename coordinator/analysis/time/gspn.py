@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import keep_time
+from petrobot.coordinator.analysis.net.coverability import find_pump
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, sum_by
-from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
+from petrobot.coordinator.analysis.net.space import LOOK, SearchLimits, Space, explore
 from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.wording import few
 
 Values = NDArray[np.float64]
 
@@ -167,9 +169,19 @@ class Chain:
     ) -> Chain:
         """Return the chain of a GSPN; its space is explored unless given.
 
-        Raises ValueError if the space is not complete (then simulate), and TimelessTrap.
+        Raises ValueError if the space is not complete (then simulate), and TimelessTrap. A space
+        of more than LOOK markings that is seen to be infinite is not searched to the limits.
         """
-        space = space or explore(gspn.net, limits=limits)
+        if space is None:
+            most = limits or SearchLimits()
+            space = explore(gspn.net, limits=replace(most, states=min(LOOK, most.states or LOOK)))
+            if not space.complete and len(space) >= LOOK:
+                if (pump := find_pump(space)) is not None:
+                    raise ValueError(
+                        f"a Markov chain needs all markings, but {few(pump[2])} can grow without "
+                        "bound; simulate instead"
+                    )
+                space = explore(gspn.net, limits=limits)
         if not space.complete:
             raise ValueError(
                 f"a Markov chain needs all markings; the search stopped: {space.reason}; "

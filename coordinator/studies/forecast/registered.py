@@ -16,8 +16,8 @@ from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.completion import completion_time, reliability_slopes
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
-from petrobot.coordinator.analysis.time.stochastic import stochastic_view
-from petrobot.coordinator.analysis.time.task_forecast import Forecast, trial_forecast
+from petrobot.coordinator.analysis.time.stochastic import STAGES, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import MATTERS, Forecast, trial_forecast
 from petrobot.coordinator.analysis.time.whatif import Change, change_task
 from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.learning import Estimates
@@ -86,6 +86,8 @@ def register(
                 )
                 if unlike := unlike_trials(regimes[name], regimes[name]["gspn"]):
                     regimes[name]["gspn"] = {"why": unlike}
+                elif "why" not in regimes[name]["gspn"]:
+                    regimes[name]["gspn"]["notes"] += _rough(regimes[name])
                 doubts = contradictions(regimes[name], regimes[name]["gspn"])
                 if doubts and not _views_miss(trainings[name], estimates, name, cell):
                     regimes[name]["doubts"] += doubts
@@ -251,6 +253,22 @@ def _apart(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[tuple[str, 
         if abs(other - value) > limit and not low <= other <= high:
             out.append((name, value, other))
     return out
+
+
+def _rough(said: Mapping[str, Any]) -> list[str]:
+    """Return, as a note, that the view's quantile is not the forecast's, whose durations are not
+    fitted."""
+    own, other = said["figures"].get("q90"), said["gspn"]["q90"]
+    if own is None or own["value"] is None or other is None:
+        return []
+    low, high = own["confidence"]
+    if low <= other <= high or abs(other - own["value"]) <= MATTERS * own["value"]:
+        return []
+    return [
+        "doubtful: its 90 % quantile is outside the interval above, because durations are fitted "
+        f"by their mean and deviation with at most {STAGES} phases, and statuses of one trial are "
+        "taken as independent"
+    ]
 
 
 def _views_miss(training: Training, estimates: Estimates, regime: str, cell: Cell | None) -> bool:

@@ -560,6 +560,30 @@ def test_rounding_errors_give_no_interval(
     assert found["P_complete_interval"] is None
 
 
+@pytest.mark.parametrize("shape", [4, 10_000])
+def test_a_quantile_that_few_phases_change_is_doubtful(
+    shape: int, write_campaign: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Eight phases are enough for a gamma distribution of shape 4, not for nearly fixed times."""
+    random = np.random.default_rng(1)
+    text = (
+        'schema = 1\n[task]\nname = "wait"\nfinal = "over == 1"\nruns_place = "jobs"\n'
+        '[places.jobs]\nkind = "control"\ntokens = 1\n[places.over]\nkind = "control"\n'
+        '[primitive_tasks.a]\ngoal = "g"\nalternatives = ["a_a"]\ndeadline = 99.0\n'
+        '[places.a]\nkind = "action"\n[transitions.begin]\nin = ["jobs"]\nout = ["a"]\n'
+        '[transitions.on]\nin = ["a:normal"]\nout = ["over"]\n'
+    )
+    trials = []
+    for _ in range(200):
+        time = float(random.gamma(shape, 10 / shape))
+        runs = [RunEntry("a", "a_a", 0.0, time, "success", taken="on")]
+        trials.append(Trial(1, 0.0, time, True, 0, runs=runs))
+    train = write_campaign("train", text, trials)
+    main(["forecast", str(tmp_path / "wait.toml"), "--estimates", str(train), *QUICK])
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("doubtful: its 90 % quantile is outside the interval above" in said) is (shape > 8)
+
+
 def test_trials_of_a_rare_success_keep_their_digits(
     write_campaign: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
