@@ -241,8 +241,8 @@ def _unlike_missions(text: str, analyses: Sequence[Analysis]) -> tuple[str, ...]
                     there, chance = _played(one.missions, word, float(argument), value)
                     if abs(value - there) > MATTERS * abs(there) and chance < SURE:
                         off[f"{call} is {value:.6g} here, {there:.6g} there"] = None
-    told = f"doubtful, as durations have few phases: missions with exact times: {'; '.join(off)}"
-    return (told,) * bool(off)
+    note = f"doubtful, as durations have few phases: missions with exact times: {'; '.join(off)}"
+    return (note,) * bool(off)
 
 
 def _played(plays: MissionFigures, word: str, given: float, value: float) -> tuple[float, float]:
