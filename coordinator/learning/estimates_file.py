@@ -14,6 +14,7 @@ real): estimates of different plants are in one file, but are never pooled.
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
@@ -410,16 +411,24 @@ class EstimatesFile:
 
     # --- the database -------------------------------------------------------------------------
 
-    @contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        """Run one transaction, which sees no half-written work of other processes; creates the file
-        if necessary."""
+    def prepare_folder(self) -> None:
+        """Create the folder if there is none. Raises EstimatesError if no file can be made in it:
+        a run that learns asks before it begins."""
+        folder = self.path.parent
         try:
-            make_folder(self.path.parent)
+            make_folder(folder)
         except OSError as fault:
             raise EstimatesError(
                 f"{self.path}: cannot create its folder: {fault.strerror}; give another path"
             ) from fault
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise EstimatesError(f"{self.path}: {folder} cannot be written; give another path")
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """Run one transaction, which sees no half-written work of other processes; creates the file
+        if necessary."""
+        self.prepare_folder()
         existed = self.path.exists()
         try:
             with self._open() as db:

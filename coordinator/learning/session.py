@@ -121,6 +121,8 @@ class LearningSession:
                 f"{setting.path}: no such file: nothing was learned that could be frozen; run with "
                 "--learn and without --frozen first"
             )
+        if not setting.frozen:
+            self.file.prepare_folder()
         kept = self.file.read(setting.plant)
         self.file.refuse_other_physics(kept, setting.physics)
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
