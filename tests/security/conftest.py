@@ -28,7 +28,7 @@ from petrobot.services.comm.tls.credentials import Credentials
 from tests.comm.ends import framed
 from tests.waiting import Limit, beat
 
-Said = Callable[..., Awaitable[tuple[int, str, str]]]
+Command = Callable[..., Awaitable[tuple[int, str, str]]]
 KEY = bytes(range(32))
 HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 3)
 SCRIPT = Path(__file__).with_name("server_process.py")
@@ -261,7 +261,7 @@ def many_files() -> Iterator[None]:
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Said:
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
     """Give a command in this process, and return its exit code and output."""
 
     async def give(*arguments: str) -> tuple[int, str, str]:

@@ -39,7 +39,7 @@ from tests.in_loop import NodeInLoop
 from tests.node.test_processes import Nodes, operator_of, pids
 from tests.ports import free_ports
 from tests.security.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
-from tests.security.conftest import Said
+from tests.security.conftest import Command
 from tests.waiting import Limit, beat, until
 
 pytestmark = pytest.mark.processes
@@ -282,16 +282,16 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("keys", ['file = "cell.key"', 'certificates = "keys"'])
 async def test_a_key_that_cannot_be_used_does_not_keep_a_stop_from_bus_and_latch(
-    tmp_path: Path, keys: str, said: Said
+    tmp_path: Path, keys: str, command: Command
 ) -> None:
     """A wrong copy of a key, in the middle of its replacement, must not disarm the stop."""
     source = cell_in(tmp_path).source
     source.write_text(f"{source.read_text()}\n[keys]\n{keys}\n")
     services = ["--services", str(source), "--journal", str(tmp_path)]
-    code, out, err = await said("estop", *services)
+    code, out, err = await command("estop", *services)
     assert code == 3 and "NO ANSWER: " in out and "No such file" in out, err
     assert "no CAN hub" in out and "latched" in out
-    code, out, _ = await said("estop", "--clear", *services)
+    code, out, _ = await command("estop", "--clear", *services)
     assert code == 0 and "No such file" in out and "; its stop is cleared on disk" in out
 
 
@@ -349,17 +349,19 @@ def test_a_busy_host_is_no_disk_that_hangs(monkeypatch: pytest.MonkeyPatch) -> N
     never.set()
 
 
-async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path, said: Said) -> None:
+async def test_a_stop_is_cleared_while_its_node_does_not_run(
+    tmp_path: Path, command: Command
+) -> None:
     """If the nodes end with the run, the stop could not be cleared otherwise: exit code 0, and the
     file is removed."""
     directory = cell_in(tmp_path)
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
-    code, out, _ = await said("estop", *services)
+    code, out, _ = await command("estop", *services)
     assert code == 3 and "latched" in out and still_stopped(directory) == ["motion"]
-    code, out, _ = await said("estop", "--clear", *services)
+    code, out, _ = await command("estop", "--clear", *services)
     assert code == 0 and "cleared on disk" in out and "NO ANSWER" not in out
     assert still_stopped(directory) == []
-    code, *_ = await said("estop", "--clear", *services)
+    code, *_ = await command("estop", "--clear", *services)
     assert code == 3, "nobody there, and nothing to clear"
 
 
@@ -404,7 +406,7 @@ def renamed(cell: Path) -> None:
 )
 @pytest.mark.parametrize("killed", [False, True])
 async def test_a_file_that_was_edited_in_mid_run_does_not_keep_a_stop_from_its_nodes(
-    tmp_path: Path, edit: Callable[[Path], Any], code: int, killed: bool, said: Said
+    tmp_path: Path, edit: Callable[[Path], Any], code: int, killed: bool, command: Command
 ) -> None:
     """A slip of the editor disarmed the stop, and a node that had another name meanwhile was not
     stopped, later only if the coordinator was `killed`. The stop is cleared where it was stored."""
@@ -418,17 +420,17 @@ async def test_a_file_that_was_edited_in_mid_run_does_not_keep_a_stop_from_its_n
         journal = ["--journal", str(tmp_path / "runs")]
         services = ["--services", str(cell), *journal]
         if killed:
-            found = await said("estop", *services)
+            found = await command("estop", *services)
         else:
             with published(tmp_path / "runs" / "run", address):
-                found = await said("estop", *journal)
+                found = await command("estop", *journal)
         assert found[0] == code and re.search("^pc +axis +stopped$", found[1], re.M), found
-        found = await said("estop", "--clear", *services)
+        found = await command("estop", "--clear", *services)
         assert found[0] == 0 and re.search("^pc +axis +cleared$", found[1], re.M), found
 
 
 async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_cleared(
-    tmp_path: Path, said: Said
+    tmp_path: Path, command: Command
 ) -> None:
     """The copy of the caller said for ever that the node was stopped, with a remedy that did
     nothing."""
@@ -438,10 +440,10 @@ async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_
         (tmp_path / name / "services.toml").write_text(cell)
     directory = load(tmp_path / "here" / "services.toml")
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
-    code, out, _ = await said("estop", *services)
+    code, out, _ = await command("estop", *services)
     assert code == 3 and "latched" in out and still_stopped(directory) == ["pc"]
     async with node_of(tmp_path / "there" / "services.toml"):
-        code, out, err = await said("estop", "--clear", *services)
+        code, out, err = await command("estop", "--clear", *services)
         assert code == 0 and "cleared" in out, (out, err)
         assert still_stopped(directory) == []
 

@@ -19,7 +19,7 @@ import pytest
 from petrobot.services.comm.protocol.security import new_key, write_key
 from tests.node.test_processes import Nodes
 from tests.ports import free_ports
-from tests.security.conftest import Said
+from tests.security.conftest import Command
 
 pytestmark = pytest.mark.processes
 HOST = "127.0.0.1"
@@ -104,9 +104,9 @@ class Middle:
 class Deceived:
     """Two nodes, and the addresses at which their callers look for them."""
 
-    def __init__(self, folder: Path, keyed: bool, said: Said) -> None:
+    def __init__(self, folder: Path, keyed: bool, command: Command) -> None:
         self.folder = folder
-        self._said = said
+        self._command = command
         self.keyed = keyed
         left, right = free_ports(2)
         self.ports = {"left": left, "right": right}
@@ -132,7 +132,7 @@ class Deceived:
         options = ["--journal", str(self.folder / "runs"), "--json", "-"]
         with pytest.MonkeyPatch.context() as environment:
             environment.setenv("PETROBOT_STATE", str(self.folder / "state of the caller's host"))
-            code, out, err = await self._said("estop", "--services", str(services), *options)
+            code, out, err = await self._command("estop", "--services", str(services), *options)
         assert out, err
         return code, {
             one["node"]: one["why"] or "?" * (one["seconds"] is None)
@@ -141,9 +141,9 @@ class Deceived:
 
 
 @asynccontextmanager
-async def deceived(folder: Path, keyed: bool, said: Said) -> AsyncIterator[Deceived]:
+async def deceived(folder: Path, keyed: bool, command: Command) -> AsyncIterator[Deceived]:
     """Start the two nodes as processes, with a shared key or without."""
-    cell = Deceived(folder, keyed, said)
+    cell = Deceived(folder, keyed, command)
     if keyed:
         write_key(folder / "cell.key", new_key())
     (folder / "services.toml").write_text(cell.text)
@@ -158,11 +158,11 @@ async def deceived(folder: Path, keyed: bool, said: Said) -> AsyncIterator[Decei
 
 @pytest.mark.parametrize("keyed", [True, False], ids=["shared key", "no key"])
 async def test_estop_names_each_node_that_was_not_reached(
-    tmp_path: Path, keyed: bool, said: Said
+    tmp_path: Path, keyed: bool, command: Command
 ) -> None:
     """Both addresses lead to one node, both are swapped, or one leads to a wrong node: the exit
     code is never 0, and only nodes that were really reached are reported as stopped."""
-    async with deceived(tmp_path, keyed, said) as cell:
+    async with deceived(tmp_path, keyed, command) as cell:
         straight = await cell.between(left="left", right="right")
         assert await cell.estop(straight) == (0, {"left": "", "right": ""}), (
             "somebody who only listens changes nothing"
@@ -179,10 +179,10 @@ async def test_estop_names_each_node_that_was_not_reached(
             ), told
 
 
-async def test_a_replayed_session_stops_no_device(tmp_path: Path, said: Said) -> None:
+async def test_a_replayed_session_stops_no_device(tmp_path: Path, command: Command) -> None:
     """The right node's answers to an earlier `estop` are replayed: their proof is of other
     nonces."""
-    async with deceived(tmp_path, True, said) as cell:
+    async with deceived(tmp_path, True, command) as cell:
         services = await cell.between(left="left", right="right")
         assert (await cell.estop(services))[0] == 0
         for middle in cell.middles:
@@ -191,12 +191,12 @@ async def test_a_replayed_session_stops_no_device(tmp_path: Path, said: Said) ->
         assert code == 3 and all("wrong_key" in why for why in told.values()), told
 
 
-async def test_nodes_shows_a_wrong_port(tmp_path: Path, said: Said) -> None:
+async def test_nodes_shows_a_wrong_port(tmp_path: Path, command: Command) -> None:
     """Two ports are swapped in services.toml, without a key: each node is reported as the other,
     and neither as up."""
-    async with deceived(tmp_path, False, said) as cell:
+    async with deceived(tmp_path, False, command) as cell:
         services = await cell.between(left="right", right="left")
-        code, out, err = await said("nodes", "--services", str(services), "--json", "-")
+        code, out, err = await command("nodes", "--services", str(services), "--json", "-")
         told = json.loads(out)
         assert code == 3, err
         assert "this is right, but the client asked for left" in told["left"]["why"]

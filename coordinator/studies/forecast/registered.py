@@ -255,10 +255,10 @@ def _apart(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[tuple[str, 
     return out
 
 
-def _rough(said: Mapping[str, Any]) -> list[str]:
-    """Return, as a note, that the view's quantile is not the forecast's, whose durations are not
-    fitted."""
-    own, other = said["figures"].get("q90"), said["gspn"]["q90"]
+def _rough(regime: Mapping[str, Any]) -> list[str]:
+    """Return a note if the quantile of the view is not that of the forecast, whose durations are
+    not fitted."""
+    own, other = regime["figures"].get("q90"), regime["gspn"]["q90"]
     if own is None or own["value"] is None or other is None:
         return []
     low, high = own["confidence"]
