@@ -71,6 +71,9 @@ UNFINISHED = (
     "stopped early: replicas that were still active are left out, so those that take long are "
     "missing in shares and times; use fewer --replicas, or a --horizon"
 )
+FEWER = (
+    "stopped early: the estimates are of the first {} of {} replicas, which all came to their end"
+)
 
 Measure = Callable[[Task, Cell | None], Measured]
 """Returns what was measured of a task that runs in a cell."""
@@ -484,7 +487,8 @@ def simulate_command(
                 doubts += _unlike_the_engine(task, measured, devices_of(cell), seen, stages)
             notes = (*(f"doubtful: {text}" for text in doubts), *_rough(view, seen, stages), *notes)
         if not seen.complete:
-            notes = (UNFINISHED, *notes)
+            missing = seen.active or seen.replicas == replicas  # of all, Ctrl-C came in the last
+            notes = (UNFINISHED if missing else FEWER.format(seen.replicas, replicas), *notes)
         return _simulated(name or path.stem, seen, notes)
     except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError) as error:
         return _refused(path, error)

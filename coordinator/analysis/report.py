@@ -474,10 +474,12 @@ class Analysis:
             or abs(w.completion_gain) >= AGREE
             or w.goal_gain >= AGREE
         ]
+        back = "no way back to the nominal flow"
+        if f.recovery_time is not None:
+            back = f"mean time back to the nominal flow at most {f.recovery_time:.3f} s"
         time = (
-            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; mean time "
-            f"back to the nominal flow at most {f.recovery_time:.3f} s; residual "
-            f"{done.residual:.1e}"
+            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; {back}; "
+            f"residual {done.residual:.1e}"
         )
         never = "  no run ever reaches `final`, so there is no mean time"
         several = f" of a mission run of {f.trials} trials" if f.trials > 1 else ""
@@ -851,7 +853,10 @@ def _as_chain(
         return []
     # What both assume explains no difference.
     ours = together(a for a in view.assumptions if a not in chain.assumptions)
-    ours.append("conflicts that neither priority nor weight decides are drawn")
+    if sum(t.after is not None for t in view.task.flat.transitions.values()) > 1:
+        ours.append("of timers that run together a longer one may elapse before a shorter one")
+    if progress.free is not None or not ours:
+        ours.append("conflicts that neither priority nor weight decides are drawn")
     theirs = together(a for a in chain.assumptions if a not in view.assumptions)
     there = f"; there: {'; '.join(theirs)}" if theirs else ""
     return [

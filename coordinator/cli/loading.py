@@ -164,6 +164,10 @@ def task_path(name: str) -> Path:
     shipped = SHIPPED / f"{name}.toml"
     if shipped.exists():
         return shipped
+    from petrobot.coordinator.analysis.formats import READ
+
+    if path.suffix.lower() in READ and not path.exists():
+        raise CommandError(2, f"{name}: no such file")
     known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
     text = f"give a .toml file, or a task that comes with petrobot: {known}"
     if Path(f"{name}.toml").is_file():

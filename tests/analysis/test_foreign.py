@@ -16,8 +16,8 @@ from petrobot.coordinator.analysis.commands import (
     convert_command,
     simulate_command,
 )
+from petrobot.coordinator.analysis.formats import losses, read_net, tree
 from petrobot.coordinator.analysis.formats import pnml as formats_pnml
-from petrobot.coordinator.analysis.formats import read_net, tree
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.formats.tree import local
 from petrobot.coordinator.analysis.net.coverability import coverability, find_pump
@@ -331,7 +331,11 @@ def test_files_as_tapaal_saves_them(tmp_path: Path, more: dict[str, str]) -> Non
     """Version 4 says each number again in colours, also in nets that have none."""
     path = tmp_path / "net.tapn"
     path.write_text(TAPAAL.format(**AS_SAVED | more), encoding="utf-8")
-    assert read_net(path).net == Net.build({"p": 2, "q": 0}, {"t": ({"p": 2}, {"q": 1})})
+    model = read_net(path)
+    assert model.net == Net.build({"p": 2, "q": 0}, {"t": ({"p": 2}, {"q": 1})})
+    constants = [text for text in losses(model, ".pnml") if "constants" in text]
+    named = "<constant" in more.get("before", "")
+    assert constants == ["the names of the constants N"] * named
 
 
 @pytest.mark.parametrize(

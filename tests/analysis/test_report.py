@@ -215,7 +215,8 @@ def test_the_forecast_of_a_task_is_consistent() -> None:
         and 0 < found.conjunctive_reliability < found.goal_reliability < 1
     )
     assert found.throughput["start"] * found.mission_time == pytest.approx(found.firings["start"])
-    assert found.mean_tokens["camera_free"] <= 1 and found.recovery_time > 0
+    assert found.mean_tokens["camera_free"] <= 1 and found.recovery_time is not None
+    assert found.recovery_time > 0
     shares = dict.fromkeys(task.net.places, 0.0)
     for one in found.worth:
         shares[one.place] += one.time_share
@@ -519,3 +520,55 @@ def test_the_fault_of_a_rates_file_names_the_rates_file(
 def test_what_holds_for_several_names_is_said_once() -> None:
     told = ["a: is slow", "the cell: is known", "b: is slow", "c: is fast", "no name"]
     assert together(told) == ["a, b: is slow", "the cell: is known", "c: is fast", "no name"]
+
+
+def test_the_forecast_says_if_there_is_no_way_back(tmp_path: Path) -> None:
+    """It said "at most 0.000 s", beside "the task can leave its nominal flow for good"."""
+    path = tmp_path / "t.toml"
+    path.write_text(
+        """schema = 1
+[task]
+name = "t"
+final = "parts == 0 and broken == 0"
+final_error = "broken == 1"
+[primitive_tasks.grip]
+deadline = 50.0
+estimates = { success = { share = 0.5, mean = 1.0 }, error = { share = 0.5, mean = 1.0 } }
+[places]
+parts = { kind = "control", tokens = 1 }
+broken = {}
+grip = { kind = "action" }
+[transitions]
+start = { in = ["parts"], out = ["grip"] }
+gripped = { in = ["grip:normal"] }
+dropped = { in = ["grip:error"], out = ["broken"] }
+""",
+        encoding="utf-8",
+    )
+    found = analyse_command(path, view="gspn")
+    assert "no way back to the nominal flow; residual" in found.text
+    assert found.data["forecast"]["recovery_time"] is None
+
+
+def test_a_doubt_names_the_order_of_timers_and_no_conflict_where_there_is_none(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "t.toml"
+    path.write_text(
+        """schema = 1
+[task]
+name = "t"
+final = "long == 1 or short == 1"
+[places]
+k = { kind = "control", tokens = 1 }
+long = { kind = "control" }
+short = { kind = "control" }
+[transitions]
+late = { in = ["k"], out = ["long"], after = 3.0 }
+soon = { in = ["k"], out = ["short"], after = 1.0 }
+""",
+        encoding="utf-8",
+    )
+    text = " ".join(analyse_command(path, view="gspn").text.split())
+    assert "of timers that run together a longer one may elapse before a shorter one" in text
+    assert "are drawn" not in text

@@ -156,3 +156,20 @@ def test_an_inhibitor_stops_arrivals() -> None:
     gspn = Gspn.of(net, {"arrives": 1.0, "leaves": 1.0})
     seen = simulate(gspn, sure(7), replicas=200, horizon=220.0, warmup=20.0, confidence=0.9999)
     assert seen.mean_tokens["waiting"].covers(1.0) and seen.mean_tokens["waiting"].high < 1.2
+
+
+def test_a_simulation_that_is_stopped_early_is_not_one_of_the_fastest_replicas() -> None:
+    """Its intervals contained only those that had ended, which take less time than the others."""
+    net = Net.build(
+        {"run": 4, "ok": 0}, {"go": ({"run": 1}, {"ok": 1}), "no": ({"run": 1}, {"run": 1})}
+    )
+    gspn = Gspn.of(net, {"go": 1.0, "no": 9.0}, servers={"go": 1, "no": 1})
+    done = completion(Chain.of(gspn), Chain.of(gspn).space.tokens(1) == 4)
+    cut = simulate(
+        gspn, sure(9), replicas=20_000, goal=lambda tokens: tokens[1] == 4, firings=300_000
+    )
+    assert not cut.complete and cut.time is not None
+    assert cut.time.covers(done.mean), (cut.time, done.mean)
+    assert not cut.active and 1000 <= cut.replicas < 20_000
+    first = simulate(gspn, sure(9), replicas=20_000, goal=lambda tokens: tokens[1] == 4, firings=30)
+    assert not first.complete and first.active == first.replicas

@@ -1087,6 +1087,7 @@ ON_THE_LINE: list[tuple[list[str], str]] = [
         r"^petrobot run: argument --mode: .*realtime.*--help shows its op",
     ),
     (["check", "."], r"no task '.': this is a folder; name the .toml file of the task"),
+    (["analyse", "queue.net"], r"^petrobot analyse: queue.net: no such file$"),
     (["run", "armbot"], r"no task 'armbot': give a .toml file, or a task that comes with petrobot"),
     (
         [*RUN, "--runs", "1000000000"],

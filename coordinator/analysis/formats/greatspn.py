@@ -177,8 +177,7 @@ class _ProjectReading:
         for tag in ("text-box", "group", "point"):
             found = sum(1 for _ in self.net.iter(tag))
             beyond += [f"<{tag}> ({found} elements of the drawing)"] if found else []
-        if self.draft.constants:
-            beyond.append(f"the names of the constants {', '.join(self.draft.constants)}")
+        beyond += self.draft.beyond()
         return NetFile(
             gspn.net if gspn else net,
             self.net.get("name", ""),

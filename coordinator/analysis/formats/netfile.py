@@ -156,6 +156,11 @@ class NetDraft:
         self.arcs = 0
         """How many arcs were read."""
 
+    def beyond(self) -> list[str]:
+        """Return what the file says and no net keeps: the names of its constants."""
+        names = ", ".join(self.constants)
+        return [f"the names of the constants {names}"] if names else []
+
     def fault(self, element: str, problem: str, remedy: str = "") -> NetFileError:
         """Return an error at the line that is being read."""
         return NetFileError(self.file, element, problem, remedy, line=self.line)

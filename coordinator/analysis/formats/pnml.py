@@ -355,7 +355,7 @@ class _PnmlReading:
             self.labels,
             self.positions,
             tuple(self.draft.notes),
-            tuple(_beyond(root)),
+            (*_beyond(root), *self.draft.beyond()),
             root if _is_iso(root, self.element) else None,
         )
 

@@ -1,12 +1,14 @@
 """Simulation of a GSPN, for chains that are too large to solve; results with confidence intervals.
 
-Many independent replicas are played side by side: one sequence of numpy operations moves all of
-them by one firing. The random generator is passed in; the same generator gives the same result.
+Up to BLOCK independent replicas are played side by side: one sequence of numpy operations moves all
+of them by one firing. Then comes the next block, so a simulation that is stopped early has blocks
+in which no replica is missing. The random generator is passed in; the same generator gives the same
+result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from statistics import NormalDist
@@ -23,6 +25,8 @@ from petrobot.coordinator.task.net import Marking
 Stop = Callable[[Tokens], Mask]
 """From tokens of shape (places, replicas) to which replicas have reached their goal, shape
 (replicas,)."""
+BLOCK = 1000
+"""The most replicas that are played side by side."""
 REMEMBERED = 1 << 22
 """The most tokens in the markings that a goal remembers: a large net seldom visits one twice."""
 
@@ -73,12 +77,17 @@ class Simulation:
     """The result of a simulation.
 
     Throughput (1/s) and mean tokens are per replica, over its observed time. `completed` is None
-    without a goal. `firings` counts those of all replicas; `complete` is False if the limit of
-    firings, the time limit or Ctrl-C ended the simulation early.
+    without a goal. `complete` is False if the limit of firings, the time limit or Ctrl-C ended the
+    simulation early. Then the estimates are those of the blocks that were played to their end, or
+    if there is none, of the replicas in the first that were: those that take long are missing.
     """
 
     replicas: int
+    """How many the estimates are of."""
+    active: int
+    """How many of these were still active when the simulation was stopped."""
     firings: int
+    """Those of all replicas that were played."""
     throughput: dict[str, IntervalEstimate]
     mean_tokens: dict[str, IntervalEstimate]
     completed: IntervalEstimate | None
@@ -164,15 +173,26 @@ def simulate(
     """
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
-    play = _Play(gspn, random, replicas, horizon, warmup, goal, lost)
+    sizes = [min(BLOCK, replicas - first) for first in range(0, replicas, BLOCK)]
+    played = [_Play(gspn, random, sizes[0], horizon, warmup, goal, lost)]
+    fired = 0
     try:
-        while len(play.alive) and play.fired < firings and not overtime():
-            play.step()
-            if progress and play.steps % 1000 == 0:
-                progress(play.fired, len(play.alive) / replicas)
+        while True:
+            block = played[-1]
+            left = replicas - sum(sizes[: len(played)])
+            while len(block.alive) and fired + block.fired < firings and not overtime():
+                block.step()
+                if progress and block.steps % 1000 == 0:
+                    progress(fired + block.fired, (left + len(block.alive)) / replicas)
+            if len(block.alive) or not left:
+                break
+            fired += block.fired
+            size = sizes[len(played)]
+            played.append(_Play(gspn, random, size, horizon, warmup, goal, lost))
+        complete = not len(played[-1].alive)
     except KeyboardInterrupt:
-        play.interrupted = True
-    return play.result(confidence)
+        complete = False
+    return _result(gspn, played, confidence, complete)
 
 
 class _Play:
@@ -194,7 +214,6 @@ class _Play:
         self.count, self.alive = count, np.arange(count)
         self.now = np.zeros(count)
         self.fired = self.steps = 0
-        self.interrupted = False
         self.fires = np.zeros((len(gspn.net.transitions), count))
         self.area = np.zeros((len(gspn.net.places), count))
         self.observed = np.zeros(count)
@@ -256,34 +275,37 @@ class _Play:
         self.alive = self.alive[which]
         self.state.tokens = self.state.tokens[:, which]
 
-    def result(self, confidence: float) -> Simulation:
-        """Return the estimates so far."""
-        seen = self.observed > 0
-        complete = not len(self.alive) and not self.interrupted
-        fires, area = self.fires[:, seen], self.area[:, seen]
-        gspn, observed = self.state.gspn, self.observed[seen]
-        rates = fires / observed if len(observed) else np.full((len(fires), 1), np.nan)
-        tokens = area / observed if len(observed) else np.full((len(area), 1), np.nan)
-        times = np.sort(self.reached[~np.isnan(self.reached)])
-        judged = self.count - len(self.alive)
-        return Simulation(
-            self.count,
-            self.fired,
-            {
-                name: IntervalEstimate.of(row, confidence)
-                for name, row in zip(gspn.net.transitions, rates, strict=True)
-            },
-            {
-                name: IntervalEstimate.of(row, confidence)
-                for name, row in zip(gspn.net.places, tokens, strict=True)
-            },
-            IntervalEstimate.share(len(times), judged, confidence)
-            if self.goal is not None and judged
-            else None,
-            IntervalEstimate.of(times, confidence) if len(times) else None,
-            times,
-            complete,
-        )
+
+def _result(gspn: Gspn, blocks: list[_Play], confidence: float, complete: bool) -> Simulation:
+    """Return the estimates of the blocks that were played to their end, else of the first one."""
+    played = [block for block in blocks if not len(block.alive)] or blocks[:1]
+    count, active = sum(play.count for play in played), sum(len(play.alive) for play in played)
+    observed = np.concatenate([play.observed for play in played])
+    seen = observed > 0
+    observed = observed[seen]
+
+    def by_replica(parts: list[Values], names: Sequence[str]) -> dict[str, IntervalEstimate]:
+        whole = np.concatenate(parts, axis=1)[:, seen]
+        each = whole / observed if len(observed) else np.full((len(whole), 1), np.nan)
+        return {
+            name: IntervalEstimate.of(row, confidence)
+            for name, row in zip(names, each, strict=True)
+        }
+
+    reached = np.concatenate([play.reached for play in played])
+    times = np.sort(reached[~np.isnan(reached)])
+    judged = count - active if played[0].goal is not None else 0
+    return Simulation(
+        count,
+        active,
+        sum(block.fired for block in blocks),
+        by_replica([play.fires for play in played], gspn.net.transitions),
+        by_replica([play.area for play in played], gspn.net.places),
+        IntervalEstimate.share(len(times), judged, confidence) if judged else None,
+        IntervalEstimate.of(times, confidence) if len(times) else None,
+        times,
+        complete,
+    )
 
 
 def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:

@@ -386,15 +386,19 @@ class Forecast:
         return slopes_of(chain, by_edge, float(g[0]))
 
     @cached_property
-    def recovery_time(self) -> float:
-        """The longest mean time back to the nominal flow (s), over all markings that can return."""
+    def recovery_time(self) -> float | None:
+        """The longest mean time back to the nominal flow (s), over all markings that can return; 0
+        if no marking leaves it, None if none that does can return."""
         ordinary = OrdinaryView(self.view.task)
         nominal = (
             self.chain.space.where(lambda m: ordinary.is_nominal(self.view.projected(m)))
             & ~self.chain.vanishing
         )
         back = completion(self.chain, nominal)
+        outside = ~nominal & ~self.chain.vanishing
         able = (back.h > 0) & ~nominal
+        if outside.any() and not able[outside].any():
+            return None
         return float(np.max(back.y[able] / back.h[able], initial=0.0))
 
     @cached_property

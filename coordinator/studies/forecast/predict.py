@@ -3,6 +3,7 @@ the simulated net; and the product rule for comparison."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -139,7 +140,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         del found["figures"]["R_goal"]
     return {
         "training_trials": len(training.trials),
-        "training_runs": len(training.runs),
+        "training_runs": _runs(training),
         "whole": training.whole,
         "same": training.same,
         "runs": request.runs,
@@ -341,7 +342,7 @@ def _from_net(
         net = _SimulatedNet(replace(training, runs=runs, changes=request.changes), asked)
     whole = net.once(request.choices, request.point, random)
     samples = net.bootstrap(request, random)
-    point, n = figures(whole), len(training.trials)
+    point, n = figures(whole), _worth(training, whole, request.point)
     times = whole.time[whole.completed]
     law = _law(times, np.ones(len(times)))
     told = {
@@ -350,6 +351,7 @@ def _from_net(
     }
     return {
         "from": NET,
+        "training_trials": n,
         "figures": told,
         "law": {**law, "trials": float(n)},
         "doubts": [
@@ -362,7 +364,7 @@ def _from_net(
             *parallel_doubts(training),
             *limit_doubts(training),
             *order_doubts(training),
-            *rare_doubts(training, np.ones(n), told),
+            *rare_doubts(training, np.ones(len(training.trials)), told),
         ],
         **_net_told(
             residual,
@@ -376,6 +378,27 @@ def _from_net(
             ],
         ),
     }
+
+
+def _runs(training: Training) -> int:
+    """Return the number of measured runs. Of an estimates file a training has each run once for
+    every place of its primitive task."""
+    if training.whole:
+        return len(training.runs)
+    by_place, runs = Counter(training.runs.place.tolist()), Counter[str]()
+    for q, place in enumerate(training.vocabulary.places):
+        name = training.task.flat.places[place].task
+        runs[name] = max(runs[name], by_place[q])
+    return runs.total()
+
+
+def _worth(training: Training, played: Played, count: int) -> int:
+    """Return of how many trials the training is. An estimates file does not say it: as many as have
+    its runs, by `count` played trials."""
+    each = sum(sum(ways.values()) for ways in played.ways.values()) / count
+    if training.whole or not each:
+        return len(training.trials)
+    return max(2, round(_runs(training) / each))
 
 
 def _net_share(value: float, samples: Values, runs: int, training: int) -> dict[str, Any]:

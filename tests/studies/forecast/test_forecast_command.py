@@ -488,6 +488,10 @@ def test_an_estimates_file_is_counted_in_runs(
     capsys.readouterr()
     main(["forecast", "--compare", str(out), str(new), "--json", "-"])
     assert json.loads(capsys.readouterr().out)["routing"] == []
+    said = json.loads(out.read_text(encoding="utf-8"))["regimes"][""]
+    assert 55 <= said["training_trials"] <= 65
+    # all completed: that of 60 trials, not of as many as there are runs and waits
+    assert 0.93 < said["figures"]["P_complete"]["confidence"][0] < 0.95
 
 
 def test_services_say_where_the_new_trials_run(
