@@ -891,6 +891,22 @@ def test_a_counter_that_nothing_resets_is_why_there_is_no_way_back(reset: bool) 
     assert not found["give_up"].possible.details
 
 
+def test_a_place_where_the_task_gives_up_is_no_counter() -> None:
+    """The run of its other branch is still being stopped after the error."""
+    task = make_task(
+        "a!=1 b!=1 done broken",
+        {
+            "well": {"in": "a:normal b:normal", "out": "done"},
+            "bad": {"in": "a:error", "out": "broken"},
+            "bad_too": {"in": "b:error", "out": "broken"},
+        },
+        final="done == 1 and broken == 0",
+    )
+    task = replace(task, final_error=parse("broken > 0"))
+    (bad,) = (r for r in judged(task).recoveries if r.name == "bad")
+    assert bad.kappa == -1 and not bad.possible.details
+
+
 def test_what_a_winner_took_is_told_where_others_can_fill_the_place() -> None:
     """`quick` has priority over the task's own way to its end."""
     net: dict[str, dict[str, Any]] = {
