@@ -72,6 +72,18 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             lambda t: t("a!=1 y", {**A, "late": {"in": "a:preempt=none", "after": 10.5}}),
         ),
         (
+            "equal-timers",
+            W,
+            "transitions.t",
+            lambda t: t(
+                "x=1",
+                {
+                    "t": {"in": "x", "after": 1.0, "weight": 1.0},
+                    "u": {"in": "x", "after": 1.0, "weight": 3.0},
+                },
+            ),
+        ),
+        (
             "unsettled-conflict",
             W,
             "transitions.t",

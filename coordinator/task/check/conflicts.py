@@ -140,6 +140,13 @@ def _judge(
     if verdict.answer is Certainty.PROVED:
         return
     key, over = f"transitions.{t.name}", " and ".join(shared)
+    if _elapse_together(t, u):
+        text = (
+            f"{t.name} and {u.name} wait for the same {t.after:g} s: {t.name}, the first in the "
+            f"file, always takes {over}; priority and weight do not count"
+        )
+        yield Finding(Severity.WARNING, "equal-timers", key, text, "give them different times")
+        return
     if not last_triggers(task, t) & last_triggers(task, u):
         text = (
             f"{t.name} and {u.name} compete for {over}: whichever becomes fireable first takes it"
@@ -163,6 +170,13 @@ def _judge(
     )
     remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
     yield Finding(Severity.WARNING, "unsettled-conflict", key, text, remedy, verdict.witness)
+
+
+def _elapse_together(t: Transition, u: Transition) -> bool:
+    """Whether two timers begin together and take the same time. The first in the file then fires
+    before the other one has elapsed."""
+    bare = not (t.events or u.events or t.when or u.when or t.inhibitors or u.inhibitors)
+    return bare and t.after is not None and t.after == u.after and t.inputs == u.inputs
 
 
 def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
