@@ -474,11 +474,11 @@ class Analysis:
             or abs(w.completion_gain) >= AGREE
             or w.goal_gain >= AGREE
         ]
-        back = "no way back to the nominal flow"
-        if f.recovery_time is not None:
-            back = f"mean time back to the nominal flow at most {f.recovery_time:.3f} s"
+        back = "no way back to the nominal flow; " if f.recovery_time is None else ""
+        if f.recovery_time:
+            back = f"mean time back to the nominal flow at most {f.recovery_time:.3f} s; "
         time = (
-            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; {back}; "
+            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; {back}"
             f"residual {done.residual:.1e}"
         )
         never = "  no run ever reaches `final`, so there is no mean time"

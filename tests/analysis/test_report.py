@@ -522,7 +522,13 @@ def test_what_holds_for_several_names_is_said_once() -> None:
     assert together(told) == ["a, b: is slow", "the cell: is known", "c: is fast", "no name"]
 
 
-def test_the_forecast_says_if_there_is_no_way_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("out", "said", "time"),
+    [("broken", "s; no way back to the nominal flow; residual", None), ("parts", "s; residual", 0)],
+)
+def test_the_forecast_says_if_there_is_no_way_back(
+    tmp_path: Path, out: str, said: str, time: float | None
+) -> None:
     """It said "at most 0.000 s", beside "the task can leave its nominal flow for good"."""
     path = tmp_path / "t.toml"
     path.write_text(
@@ -541,13 +547,13 @@ grip = { kind = "action" }
 [transitions]
 start = { in = ["parts"], out = ["grip"] }
 gripped = { in = ["grip:normal"] }
-dropped = { in = ["grip:error"], out = ["broken"] }
-""",
+dropped = { in = ["grip:error"], out = ["OUT"] }
+""".replace("OUT", out),
         encoding="utf-8",
     )
     found = analyse_command(path, view="gspn")
-    assert "no way back to the nominal flow; residual" in found.text
-    assert found.data["forecast"]["recovery_time"] is None
+    assert said in found.text
+    assert found.data["forecast"]["recovery_time"] == time
 
 
 def test_a_doubt_names_the_order_of_timers_and_no_conflict_where_there_is_none(
