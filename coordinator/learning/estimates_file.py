@@ -14,13 +14,13 @@ real): estimates of different plants are in one file, but are never pooled.
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from petrobot.coordinator.learning.estimates_tables import (
@@ -74,6 +74,7 @@ from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
 """Seconds that a command waits while another one writes the file."""
+REMEDY = "give --learn a file that can be written, in a folder that can be"
 UNWRITABLE = {
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_FULL,
@@ -411,24 +412,26 @@ class EstimatesFile:
 
     # --- the database -------------------------------------------------------------------------
 
-    def prepare_folder(self) -> None:
-        """Create the folder if there is none. Raises EstimatesError if no file can be made in it:
-        a run that learns asks before it begins."""
-        folder = self.path.parent
+    def refuse_unwritable(self) -> None:
+        """Raises EstimatesError if no file can be made here: a run that learns asks before it
+        begins."""
         try:
-            make_folder(folder)
+            folder = next(p for p in self.path.absolute().parents if p.exists())
+            with TemporaryFile(dir=folder):  # it has no name, so nothing is left of it
+                pass
         except OSError as fault:
-            raise EstimatesError(
-                f"{self.path}: cannot create its folder: {fault.strerror}; give another path"
-            ) from fault
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise EstimatesError(f"{self.path}: {folder} cannot be written; give another path")
+            raise EstimatesError(f"{self.path}: {fault.strerror}; {REMEDY}") from fault
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """Run one transaction, which sees no half-written work of other processes; creates the file
         if necessary."""
-        self.prepare_folder()
+        try:
+            make_folder(self.path.parent)
+        except OSError as fault:
+            raise EstimatesError(
+                f"{self.path}: cannot create its folder: {fault.strerror}; give another path"
+            ) from fault
         existed = self.path.exists()
         try:
             with self._open() as db:
@@ -487,7 +490,7 @@ class EstimatesFile:
         except sqlite3.Error as fault:
             remedy = "restore it from a copy, or give --learn another file"
             if getattr(fault, "sqlite_errorcode", 0) & 0xFF in UNWRITABLE:
-                remedy = "give --learn a file that can be written, in a folder that can be"
+                remedy = REMEDY
             raise EstimatesError(f"{self.path}: {fault}; {remedy}") from fault
         except (ValueError, KeyError, TypeError) as fault:
             raise EstimatesError(

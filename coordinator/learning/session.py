@@ -122,7 +122,7 @@ class LearningSession:
                 "--learn and without --frozen first"
             )
         if not setting.frozen:
-            self.file.prepare_folder()
+            self.file.refuse_unwritable()
         kept = self.file.read(setting.plant)
         self.file.refuse_other_physics(kept, setting.physics)
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
