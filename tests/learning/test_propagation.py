@@ -218,7 +218,7 @@ def test_a_recovery_that_never_ran_has_its_declared_cost(
     errors: int, cost: str, declared: str, of_mend: float | None
 ) -> None:
     """Where the cost is time, its declared duration. Without either, C is unknown if the recovery
-    is part of it; else its interval lacks the recovery, and that is said."""
+    is part of it; else its interval lacks the recovery, and a note names it."""
     text = SERIES + RECOVERY.replace("COST", cost).replace("DECLARED", declared)
     known = Estimates({TallyKey("a", "do_a"): tally(15, 0, errors, 2.0)})
     found = propagate(loads(text, "recovery"), known)

@@ -748,8 +748,8 @@ class Progress:
 
     def _never_reset(self, target: int) -> tuple[str, ...]:
         """Return which places of an error branch are marked from a state on, whatever happens,
-        until the task gives up: a counter that nothing resets counts as an error that remains. None
-        if the task can no longer reach its end: then that is why."""
+        until the task gives up: a counter that nothing resets counts as an error that remains.
+        Empty if the task can no longer reach its end: then that is why."""
         x, net = self.x, self.x.engine.compiled.net
         if not x.graph.backward(x.final)[target]:
             return ()
