@@ -8,7 +8,6 @@ another node.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -69,28 +68,36 @@ class Middle:
         assert task is not None
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
-            if self.replay is not None:
+        try:  # `stop` may cancel at any line
+            if self.replay is None:
+                await self._relay(reader, writer)
+            else:
                 await reader.read(1)
                 writer.write(self.replay)
                 await reader.read()
-            else:
-                there, back = await asyncio.open_connection(HOST, self.to)
-                number = len(self.recorded)
-                self.recorded.append(b"")
+        except ConnectionError:
+            pass
+        finally:
+            writer.close()
 
-                async def answers() -> None:
-                    while data := await there.read(1 << 16):
-                        self.recorded[number] += data
-                        writer.write(data)
-                    writer.close()
+    async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there, back = await asyncio.open_connection(HOST, self.to)
+        number = len(self.recorded)
+        self.recorded.append(b"")
 
-                answering = asyncio.ensure_future(answers())
-                while data := await reader.read(1 << 16):
-                    back.write(data)
-                back.close()
-                await asyncio.gather(answering, return_exceptions=True)
-        writer.close()
+        async def answers() -> None:
+            while data := await there.read(1 << 16):
+                self.recorded[number] += data
+                writer.write(data)
+            writer.close()
+
+        answering = asyncio.ensure_future(answers())
+        try:
+            while data := await reader.read(1 << 16):
+                back.write(data)
+        finally:
+            back.close()
+            await asyncio.gather(answering, return_exceptions=True)
 
     async def stop(self) -> None:
         """Close all connections."""
