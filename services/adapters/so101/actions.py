@@ -39,7 +39,7 @@ async def move_to(
     speed: float = 1.0,
     timeout: float = 10.0,
 ) -> Result:
-    """Move the gripper's tip to a point (m, frame of `kinematics`). `pitch` is the gripper's angle
+    """Move the gripper's tip to a point (m, frame of `CHAIN`). `pitch` is the gripper's angle
     above the horizontal, `roll` the angle of its last joint (rad). The joints arrive together; the
     tip does not move on a straight line."""
     try:

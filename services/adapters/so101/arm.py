@@ -181,7 +181,7 @@ class Joint:
 
 class Arm(Driver):
     """A SO-101 on a serial port. Its workspace bounds the gripper's tip, in the frame of
-    `kinematics`."""
+    `CHAIN`."""
 
     period = 0.02
     obeys = ("speed", "workspace", "dry_run", "pause")
