@@ -88,6 +88,6 @@ def test_the_times() -> None:
         "There are 2 s",
         "(1.5 s)",
         "for 10 minutes (at most 1,000",
-        "100,000 groups of 4,096",
+        "last three digits are bits of one group; there are 100,000 groups",
     ):
         assert said in " ".join(PAGE.split())

@@ -179,19 +179,23 @@ _weigh = msgpack.Packer(default=lambda value: None, unicode_errors="surrogatepas
 
 
 _DIGITS = "0123456789"
-_SHIFT = 12
-_IN_GROUP = (1 << _SHIFT) - 1
-"""4,096 numbers are in one group: a bit set of 512 bytes when all of them are used."""
+_ENDS = {
+    end: bit
+    for bit, end in enumerate(
+        ["", *(f"{n:0{size}}" for size in (1, 2, 3) for n in range(10**size))]
+    )
+}
+"""The bit of each end of an id in its group: of no, one, two or three digits."""
 
 
 class FinishedIds:
     """Ids of calls whose results are dropped, stored so compactly that ordinary use never forgets
     one.
 
-    Callers count their calls (docs/protocol.md, `id`). So an id is split into its text and its
-    trailing number, and the numbers of one text are bits of a Python integer, 4,096 per group. A
-    million calls of one caller need 245 groups, about 128 KB. At most `limit` groups are kept; then
-    the oldest is dropped.
+    Callers count their calls (docs/protocol.md, `id`). So the last three digits of an id are a bit
+    of a Python integer, and the text before them names its group. A million calls of one caller
+    need about 1,000 groups of 300 bytes. At most `limit` groups are kept; then the oldest is
+    dropped.
 
     Dropping a group means that an unknown id may have run before. `complete` says whether that can
     be; the callee then refuses repeated calls that it does not know (`Call.again`).
@@ -199,36 +203,33 @@ class FinishedIds:
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self._groups: OrderedDict[tuple[str, int], int] = OrderedDict()
+        self._groups: OrderedDict[str, int] = OrderedDict()
         self.complete = True
         """Whether no id was ever forgotten: then an unknown id certainly never ran here."""
 
     def __contains__(self, id_: str) -> bool:
-        text, number = _split(id_)
-        bits = self._groups.get((text, number >> _SHIFT))
-        return bits is not None and bits >> (number & _IN_GROUP) & 1 == 1
+        group, bit = _split(id_)
+        bits = self._groups.get(group)
+        return bits is not None and bits >> bit & 1 == 1
 
     def add(self, id_: str) -> None:
         """Remember an id."""
-        text, number = _split(id_)
-        groups, group = self._groups, (text, number >> _SHIFT)
-        groups[group] = groups.get(group, 0) | 1 << (number & _IN_GROUP)
+        group, bit = _split(id_)
+        groups = self._groups
+        groups[group] = groups.get(group, 0) | 1 << bit
         if len(groups) > self._limit:
             groups.popitem(last=False)
             self.complete = False
 
 
 def _split(id_: str) -> tuple[str, int]:
-    """Split an id into its text and its trailing number. Leading zeros stay with the text, so no
-    two ids give the same pair."""
-    text = id_.rstrip(_DIGITS)
-    digits = id_[len(text) :]
-    if not digits:
-        return text, 0
-    if digits[0] == "0":
-        digits = digits.lstrip("0")
-        return id_[: len(id_) - len(digits)], int(digits or 0)
-    return text, int(digits)
+    """Return the group of an id and its bit there. No two ids have both in common, because group
+    and end together are the id."""
+    bit = _ENDS.get(id_[-3:])
+    if bit is not None:
+        return id_[:-3], bit
+    group = id_.rstrip(_DIGITS)
+    return group, _ENDS[id_[len(group) :]]
 
 
 class ResultStore:
