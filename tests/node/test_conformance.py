@@ -457,6 +457,22 @@ class LeavesInItsStep(Axis):
         sys.exit("the library has had enough")
 
 
+class InterruptsItsStep(Axis):
+    def step(self, now: float) -> None:
+        super().step(now)
+        raise KeyboardInterrupt
+
+
+class InterruptsItsEnd(Axis):
+    def close(self) -> None:
+        raise KeyboardInterrupt
+
+
+class LeavesWhenMade(Axis):
+    def setup(self) -> None:
+        sys.exit("no licence")
+
+
 class EndsTheProcess(Axis):
     def stop(self, now: float) -> None:
         os._exit(0)
@@ -569,6 +585,9 @@ class DrawsByItself(Axis):
         (HasAListAsState, "state: expected a table, got [0.0]"),
         (CannotBeClosed, "close: OSError: the port is gone in close (test_conformance.py:"),
         (LeavesInItsStep, "SystemExit: the library has had enough in step (test_conformance.py:"),
+        (InterruptsItsStep, "the driver raised KeyboardInterrupt:  in step (test_conformance.py:"),
+        (InterruptsItsEnd, "close: KeyboardInterrupt:  in close (test_conformance.py:"),
+        (LeavesWhenMade, "it cannot be made: SystemExit: no licence in setup ("),
         (EndsTheProcess, "SystemExit: it called os._exit(0) in stop (test_conformance.py:"),
         (Hangs, "Hung: did not come back in time"),
         (HangsInClose, "Hung: did not come back in time"),
