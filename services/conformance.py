@@ -58,6 +58,9 @@ BUSY = 0.3
 system are slow, and a wait tells nothing of the driver."""
 ALWAYS = 5, 0.8
 """A method that waits so often, and in this share of its calls, does so on any computer."""
+EQUAL = 20, 0.1
+"""So does one that waits so often, and always for the same time: without the tenth at each end, its
+waits differ by at most this share. A busy computer delays by any time."""
 LEAVING = 2.0
 """Seconds in which the threads and processes of a closed driver must end."""
 HELD = 3
@@ -990,8 +993,10 @@ class _Check:
                 why = "its library does not release the lock (GIL); put it into another process"
             if name == "sleep" and len(waits) < HELD:
                 continue
+            least, most = _middle(waits)
             always = len(waits) >= max(ALWAYS[0], ALWAYS[1] * self.calls[name])
-            if queued > BUSY * ran and not always:
+            equal = len(waits) >= EQUAL[0] and most <= (1.0 + EQUAL[1]) * least
+            if queued > BUSY * ran and not (always or equal):
                 self.found.busy.append(f"{text}, perhaps because this computer is busy")
             else:
                 self.fault(f"{text}: {why}")
@@ -1000,6 +1005,12 @@ class _Check:
                 f"step: {self.late} of {self.steps} took longer than the period of "
                 f"{self.period:g} s, the longest {self.longest:.3f} s: it must not wait"
             )
+
+
+def _middle(numbers: Sequence[float]) -> tuple[float, float]:
+    """Return the least and the most of them, without the tenth at each end."""
+    placed, cut = sorted(numbers), len(numbers) // 10
+    return placed[cut], placed[-1 - cut]
 
 
 def _children() -> dict[int, str]:

@@ -1049,3 +1049,20 @@ def test_a_stop_that_always_waits_is_told_on_a_busy_computer(
     found = check_driver(Waits, [{"to": 0.1}, {"to": 0.0}], simulated=True)
     (fault,) = found.faults
     assert fault.startswith("stop: ") and "calls waited" in fault
+
+
+def test_a_step_that_waits_now_and_then_is_told_on_a_busy_computer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As one whose library sends a question now and then, and waits for the answer."""
+
+    class Waits(Axis):
+        def step(self, now: float) -> None:
+            super().step(now)
+            if self.cycles % 100 == 0:
+                time.sleep(0.1)
+
+    monkeypatch.setattr(conformance, "BUSY", -1.0)
+    found = check_driver(Waits, [{"to": 0.1}, {"to": 0.0}], simulated=True)
+    (fault,) = found.faults
+    assert fault.startswith("step: ") and "calls waited" in fault
