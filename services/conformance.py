@@ -32,7 +32,7 @@ from petrobot.services.comm.protocol.plain import plain
 from petrobot.services.device import LIMITS, Driver, QuickStopping, keys_of
 from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.rehearsal import TestPorts
-from petrobot.services.worker.callables import RAISED, describe
+from petrobot.services.worker.callables import RAISED, describe, from_outside
 from petrobot.services.worker.runner import Hung
 
 Command = Mapping[str, Any]
@@ -48,8 +48,9 @@ SLOWEST, NOISE = 0.05, 5.0
 more than this multiple of its change at rest."""
 LATE_SHARE = 0.02
 """Share of steps that may take longer than the period: a busy computer delays some."""
-FAULTS = (*RAISED, Hung)
-"""What code of a driver may raise, or the watchdog in it."""
+FAULTS = (*RAISED, KeyboardInterrupt, Hung)
+"""What code of a driver may raise, or the watchdog in it. (A KeyboardInterrupt `from_outside` is a
+Ctrl-C.)"""
 WAIT = 0.03
 """Seconds that a method may wait if the period is shorter."""
 BUSY = 0.3
@@ -57,6 +58,9 @@ BUSY = 0.3
 system are slow, and a wait tells nothing of the driver."""
 ALWAYS = 5, 0.8
 """A method that waits so often, and in this share of its calls, does so on any computer."""
+EQUAL = 20, 0.1
+"""So does one that waits so often, and always for the same time: without the tenth at each end, its
+waits differ by at most this share. A busy computer delays by any time."""
 LEAVING = 2.0
 """Seconds in which the threads and processes of a closed driver must end."""
 HELD = 3
@@ -136,7 +140,9 @@ def check_driver(
     make = _with_ports(make, clock.monotonic)
     try:
         check = _Check(make, clock, within, first, positions, progress)
-    except Hung as fault:
+    except (SystemExit, GeneratorExit, KeyboardInterrupt, Hung) as fault:
+        if from_outside(fault):
+            raise
         return DriverCheck([f"it cannot be made: {describe(fault)}"])
     try:
         check.rules(commands, seconds, cable)
@@ -146,7 +152,8 @@ def check_driver(
         check.fault(str(fault))
     except FAULTS as fault:
         *_, (where, _) = traceback.walk_tb(fault.__traceback__)
-        if where.f_code.co_filename == __file__:  # no fault of the driver, but a bug here
+        # no fault of the driver, but a Ctrl-C, or a bug here
+        if from_outside(fault) or where.f_code.co_filename == __file__:
             raise
         verb = "hangs:" if isinstance(fault, Hung) else "raised"
         check.fault(f"the driver {verb} {describe(fault)}")
@@ -919,7 +926,9 @@ class _Check:
         try:
             with self.watch:
                 self.driver.close()
-        except RAISED as fault:
+        except (*RAISED, KeyboardInterrupt) as fault:
+            if from_outside(fault):
+                raise
             self.fault(f"close: {describe(fault)}")
 
     def seeds(self, clock: _Clock, commands: Sequence[Command]) -> None:
@@ -949,6 +958,8 @@ class _Check:
             with self.watch:
                 self.driver.stop(self.now())
         except FAULTS as fault:
+            if from_outside(fault):
+                raise
             self.fault(f"stop at the end: {describe(fault)}")
         finally:
             with suppress(Hung):  # that was found before
@@ -982,8 +993,10 @@ class _Check:
                 why = "its library does not release the lock (GIL); put it into another process"
             if name == "sleep" and len(waits) < HELD:
                 continue
+            least, most = _middle(waits)
             always = len(waits) >= max(ALWAYS[0], ALWAYS[1] * self.calls[name])
-            if queued > BUSY * ran and not always:
+            equal = len(waits) >= EQUAL[0] and most <= (1.0 + EQUAL[1]) * least
+            if queued > BUSY * ran and not (always or equal):
                 self.found.busy.append(f"{text}, perhaps because this computer is busy")
             else:
                 self.fault(f"{text}: {why}")
@@ -992,6 +1005,12 @@ class _Check:
                 f"step: {self.late} of {self.steps} took longer than the period of "
                 f"{self.period:g} s, the longest {self.longest:.3f} s: it must not wait"
             )
+
+
+def _middle(numbers: Sequence[float]) -> tuple[float, float]:
+    """Return the least and the most of them, without the tenth at each end."""
+    placed, cut = sorted(numbers), len(numbers) // 10
+    return placed[cut], placed[-1 - cut]
 
 
 def _children() -> dict[int, str]:

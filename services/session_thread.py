@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import importlib
 import logging
+import socket
+import struct
 import threading
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator
@@ -82,8 +84,14 @@ class SessionThread:
 
     # --- for the session
 
-    def opened(self, item: Any = None) -> None:
-        """Report that the session can be used."""
+    def opened(self, item: Any = None, sock: Any = None) -> None:
+        """Report that the session can be used. `sock` is its socket, as `get_extra_info("socket")`
+        of an asyncio transport returns it: when it is closed, what the device has not received is
+        dropped."""
+        if sock is not None:
+            # Else the system still delivers it: minutes later, if a cable was out meanwhile, and
+            # after what the next session has sent, such as a stop.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._opened, self._open, self._outbox = self._opened + 1, True, asyncio.Queue(WAITING)
         self.tell("up", item)
 

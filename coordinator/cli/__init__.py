@@ -151,9 +151,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     if argv is not None:
         return _safe_main(list(argv), uptime())
+    _open_standard_files()
     code = _safe_main(sys.argv[1:], _begun())
     leave_threads(code)
     return code
+
+
+def _open_standard_files() -> None:
+    """Open what the caller has closed of standard input, output and error (`>&-`): else the next
+    files that this process and its children open get their numbers, and with them what is
+    printed."""
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+        os.set_inheritable(number, True)
+    os.close(number)
+    sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
 
 
 def _safe_main(arguments: list[str], ordered: float) -> int:

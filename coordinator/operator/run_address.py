@@ -75,15 +75,21 @@ def find_address(name: str | None = None, folder: Path = DEFAULT) -> RunAddress:
 def waiting(folder: Path) -> list[str]:
     """Return the runs whose coordinator has died, the newest first: they wait for `resume`."""
     found = _newest_first(folder)
-    return [path.parent.name for path in found if _read(path) is None and path.exists()]
+    return [path.parent.name for path in found if _readable(path) and _read(path) is None]
 
 
 def _refuse_dead(path: Path) -> None:
-    """Raise NoRunError if the coordinator of a run has died: else it would have removed the
-    file."""
-    if path.exists():
-        run = path.parent.name
+    """Raise NoRunError if the coordinator of a run has died, else it would have removed the file;
+    also if only another user may know."""
+    run = path.parent.name
+    if _readable(path):
         raise NoRunError(f"{run} was interrupted: `petrobot resume {run}` continues it")
+    if path.exists():
+        raise NoRunError(f"{run} was started by another user, who alone can watch or control it")
+
+
+def _readable(path: Path) -> bool:
+    return os.access(path, os.R_OK, effective_ids=True)
 
 
 def _newest_first(folder: Path) -> list[Path]:

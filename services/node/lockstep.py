@@ -4,6 +4,7 @@ reached by envelopes."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import chdir
 from typing import TYPE_CHECKING, Any
 
 from petrobot.services.comm.canopen.bus import Frame
@@ -271,7 +272,8 @@ class LockstepNode:
             ports = self._ports[device] = LockstepPorts(
                 directory, entry, self._clock, self._out.append
             )
-            driver = make_driver(directory, entry, ports)
+            with chdir("."):  # it may change the folder of this process, which is not its own
+                driver = make_driver(directory, entry, ports)
             reseed = ports.draws.reseed
             if device not in directory.without_actions(self.name):
                 reseed(0)
@@ -355,7 +357,8 @@ class LockstepNode:
     def close(self) -> None:
         """Close the devices."""
         self._watchdog.close()
-        self.node.close(self._now)
+        with chdir("."):
+            self.node.close(self._now)
 
     # --- messages -----------------------------------------------------------------------------
 

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import selectors
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any, cast
+
+import pytest
 
 from petrobot import Driver, rehearse
 
@@ -23,3 +29,64 @@ def rehearsed(story: Callable[..., Any], arm: Driver, world: Callable[[float], N
     finally:
         arm.close()
     assert told.status == "success", told
+
+
+class SmallRelay:
+    """A server on this host that passes bytes on to another one, in both directions, until it
+    stalls: as at a pulled cable, what a client sends then stays with the client's system."""
+
+    def __init__(self) -> None:
+        self._listener = socket.socket()
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        self._listener.bind(("127.0.0.1", 0))
+        self._listener.listen()
+        self.port = self._listener.getsockname()[1]
+        self.late = bytearray()
+        """What the first client has delivered after the stall."""
+        self._stalled, self._over = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, port: int) -> None:
+        """Pass the bytes of the first client on to a port of this host."""
+        self._thread = threading.Thread(target=self._serve, args=(port,))
+        self._thread.start()
+
+    def stall(self) -> None:
+        """Read nothing more of it."""
+        self._stalled.set()
+
+    def read(self) -> bytes:
+        """Read on until the first client's connection ends; return what came."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join(30.0)
+            assert not self._thread.is_alive()
+        return bytes(self.late)
+
+    def close(self) -> None:
+        self.stall()
+        self.read()
+        self._listener.close()
+
+    def _serve(self, port: int) -> None:
+        self._listener.settimeout(30.0)
+        near, _ = self._listener.accept()
+        with near, socket.create_connection(("127.0.0.1", port)) as far:
+            with selectors.DefaultSelector() as ready:
+                ready.register(near, selectors.EVENT_READ, far)
+                ready.register(far, selectors.EVENT_READ, near)
+                while not self._stalled.is_set():
+                    for found, _ in ready.select(0.02):
+                        cast(socket.socket, found.data).sendall(found.fileobj.recv(4096))  # type: ignore[union-attr]
+            self._over.wait(60.0)
+            near.settimeout(20.0)
+            with suppress(ConnectionResetError):
+                while data := near.recv(65536):
+                    self.late += data
+
+
+@pytest.fixture
+def relay() -> Iterator[SmallRelay]:
+    made = SmallRelay()
+    yield made
+    made.close()

@@ -4,6 +4,7 @@ exception's name."""
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -329,3 +330,17 @@ def test_a_laboratory_that_cannot_be_made_is_named(petrobot: Petrobot) -> None:
     code, _, said = petrobot(*run)
     assert code == 2 and "Traceback" not in said
     assert "cell.toml: nodes.lab: gone.toml: cannot be read" in said
+
+
+@pytest.mark.processes
+def test_standard_files_that_the_caller_has_closed(tmp_path: Path) -> None:
+    """Nothing is printed into a file that got the number of one of them."""
+    command = f"{shlex.quote(sys.executable)} -m petrobot.coordinator"
+    robot = f"{command} new robot carrier"
+    ran = f"{command} run carrier.toml --mode lockstep --journal runs"
+    script = f"{robot} <&- >&- 2>&- && cd carrier && {ran} <&- >&- 2>&- && {command} log last >&-"
+    done = subprocess.run(
+        ["sh", "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0 and done.stdout == done.stderr == ""
+    assert (tmp_path / "carrier" / "services.toml").read_text().startswith("schema = 1")

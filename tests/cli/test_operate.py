@@ -24,6 +24,7 @@ from petrobot.coordinator.operator.run_address import (
     RunAddress,
     find_address,
     published,
+    waiting,
 )
 from petrobot.coordinator.page import app_state
 from petrobot.coordinator.run import realtime
@@ -655,3 +656,24 @@ async def test_the_result_says_that_the_host_was_too_busy(petrobot: Terminal) ->
     assert (await petrobot("abort")).code == 0
     await until(lambda: bool(petrobot.mission.remarks))
     assert "ms late" in petrobot.mission.result("realtime", 1.0)["host"]
+
+
+def test_the_run_of_another_user_is_not_said_to_be_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its address can only be read by its owner."""
+    tmp_path.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    runs, me = Path("runs"), os.geteuid()
+    with published(runs / "theirs", RunAddress("theirs", "http://x", "t", os.getpid())) as path:
+        (runs / "theirs" / JOURNAL).touch()
+        path.chmod(0)
+        if me == 0:
+            os.seteuid(65534)  # root may read it
+        try:
+            assert waiting(runs) == []
+            for name in (None, "theirs"):
+                with pytest.raises(NoRunError, match="theirs was started by another user"):
+                    find_address(name, runs)
+        finally:
+            os.seteuid(me)

@@ -77,6 +77,26 @@ def test_a_peer_that_does_not_read_is_given_up(near: tuple[str, int, socket.sock
                 line.send(bytes(BACKLOG))
 
 
+def test_what_a_peer_does_not_take_in_time_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The line is lost, and its commands cannot come after those of the next one."""
+    monkeypatch.setattr(lines, "CONNECTING", 0.5)
+    with socket.socket() as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        line = TcpConnection("127.0.0.1", listener.getsockname()[1])
+        far, _ = listener.accept()
+        with far, contextlib.closing(line):
+            line.send(bytes(60_000))
+            assert "timed out" in lost(line)
+            received = 0
+            far.settimeout(10.0)
+            with contextlib.suppress(ConnectionResetError):
+                while data := far.recv(65536):
+                    received += len(data)
+            assert 0 < received < 60_000
+
+
 def test_a_port_where_nothing_listens_is_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]

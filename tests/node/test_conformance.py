@@ -457,6 +457,22 @@ class LeavesInItsStep(Axis):
         sys.exit("the library has had enough")
 
 
+class InterruptsItsStep(Axis):
+    def step(self, now: float) -> None:
+        super().step(now)
+        raise KeyboardInterrupt
+
+
+class InterruptsItsEnd(Axis):
+    def close(self) -> None:
+        raise KeyboardInterrupt
+
+
+class LeavesWhenMade(Axis):
+    def setup(self) -> None:
+        sys.exit("no licence")
+
+
 class EndsTheProcess(Axis):
     def stop(self, now: float) -> None:
         os._exit(0)
@@ -569,6 +585,9 @@ class DrawsByItself(Axis):
         (HasAListAsState, "state: expected a table, got [0.0]"),
         (CannotBeClosed, "close: OSError: the port is gone in close (test_conformance.py:"),
         (LeavesInItsStep, "SystemExit: the library has had enough in step (test_conformance.py:"),
+        (InterruptsItsStep, "the driver raised KeyboardInterrupt:  in step (test_conformance.py:"),
+        (InterruptsItsEnd, "close: KeyboardInterrupt:  in close (test_conformance.py:"),
+        (LeavesWhenMade, "it cannot be made: SystemExit: no licence in setup ("),
         (EndsTheProcess, "SystemExit: it called os._exit(0) in stop (test_conformance.py:"),
         (Hangs, "Hung: did not come back in time"),
         (HangsInClose, "Hung: did not come back in time"),
@@ -1030,3 +1049,20 @@ def test_a_stop_that_always_waits_is_told_on_a_busy_computer(
     found = check_driver(Waits, [{"to": 0.1}, {"to": 0.0}], simulated=True)
     (fault,) = found.faults
     assert fault.startswith("stop: ") and "calls waited" in fault
+
+
+def test_a_step_that_waits_now_and_then_is_told_on_a_busy_computer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As one whose library sends a question now and then, and waits for the answer."""
+
+    class Waits(Axis):
+        def step(self, now: float) -> None:
+            super().step(now)
+            if self.cycles % 100 == 0:
+                time.sleep(0.1)
+
+    monkeypatch.setattr(conformance, "BUSY", -1.0)
+    found = check_driver(Waits, [{"to": 0.1}, {"to": 0.0}], simulated=True)
+    (fault,) = found.faults
+    assert fault.startswith("step: ") and "calls waited" in fault

@@ -285,3 +285,37 @@ def test_an_ended_thread_does_not_crash_the_watchdog() -> None:
         watched.look()
         assert not watched._attempts
     watched.close()
+
+
+@pytest.mark.processes
+def test_code_that_changes_the_working_folder(tmp_path: Path) -> None:
+    """In lock step it runs in the process of the command, whose files must come where they were
+    asked for."""
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+
+    def petrobot(folder: Path, *words: str) -> str:
+        command = [sys.executable, "-m", "petrobot.coordinator", *words]
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+        assert done.returncode == 0, done
+        return done.stderr
+
+    petrobot(tmp_path, "new", "robot", "carrier")
+    robot = tmp_path / "carrier"
+    text, leave = (robot / "carrier.py").read_text(), f"os.chdir({str(elsewhere)!r})"
+    methods = {"setup(self)": "setup()", "close(self)": "close()"}
+    for method, call in methods.items():
+        added = f"    def {method} -> None:\n        {leave}\n        super().{call}\n\n"
+        text = text.replace("    def step(", f"{added}    def step(", 1)
+    for line in ("        super().step(now)\n", "    await ctx.sleep(0.3)\n"):
+        assert line in text
+        text = text.replace(line, f"{line[: -len(line.lstrip())]}{leave}\n{line}")
+    (robot / "carrier.py").write_text(
+        text.replace("\nfrom petrobot", "\nimport os\nfrom petrobot", 1)
+    )
+    asked = ("--mode", "lockstep", "--journal", "runs", "--json", "out.json")
+    told = petrobot(robot, "run", "carrier.toml", *asked)
+    assert told.count("changed the working folder") == 1
+    assert (robot / "out.json").exists() and [*(robot / "runs").glob("*/result.json")]
+    assert not [*elsewhere.iterdir()]

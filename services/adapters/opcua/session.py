@@ -244,8 +244,8 @@ class OpcUaSession(Driver):
         except (TimeoutError, ConnectionError):
             # A frozen server would not answer the goodbye either. asyncua may already take
             # itself for disconnected, and then leaves this socket open.
-            if protocol := client.uaclient.protocol:
-                protocol.disconnect_socket()
+            if (protocol := client.uaclient.protocol) and protocol.transport:
+                protocol.transport.abort()
             raise
         finally:
             await client.disconnect()
@@ -295,6 +295,7 @@ class OpcUaSession(Driver):
 
         nodes: dict[str, tuple[Any, Any]] = {}
         faults: dict[str, str] = {}
+        sock = client.uaclient.protocol.transport.get_extra_info("socket")
         heard = _Notifications(session, LARGEST // max(1, len(self.nodes)))
         subscription = await client.create_subscription(1000 * self.interval, heard)
         heartbeat = client.get_node(HEARTBEAT)
@@ -307,7 +308,7 @@ class OpcUaSession(Driver):
                 await subscription.subscribe_data_change(node)
             except (ua.UaError, ValueError) as fault:
                 faults[name] = f"{text}: {fault}"
-        session.opened(faults)
+        session.opened(faults, sock)
         while True:
             try:
                 values = await session.get(LOOK)

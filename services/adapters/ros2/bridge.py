@@ -89,7 +89,7 @@ async def serve(url: str, heartbeat: float | None, session: SessionThread) -> No
         async with asyncio.timeout(CONNECTING):
             socket = await http.ws_connect(url, heartbeat=heartbeat, max_msg_size=LARGEST)
         async with socket:
-            session.opened()
+            session.opened(sock=socket.get_extra_info("socket"))
             sending = asyncio.create_task(_send(session, socket))
             try:
                 await _receive(session, socket)

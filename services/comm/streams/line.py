@@ -16,7 +16,7 @@ BACKLOG: Final = 65536
 """Most bytes that wait to be sent: a line with more of them is broken. Also most bytes
 that one `receive` of a TCP connection returns."""
 CONNECTING: Final = 2.0
-"""Seconds that a TCP connection may take to be made."""
+"""Seconds that a TCP connection may take to be made, and its peer to acknowledge bytes."""
 PAUSES: Final = (0.2, 3.2)
 """Shortest and longest time between two attempts to open a line (s): doubled each time."""
 UNIX: Final = "unix:"
@@ -112,6 +112,10 @@ class TcpConnection(ByteLine):
         self._socket.setblocking(False)
         if family is not socket.AF_UNIX:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # Else the system delivers old commands, also of a process that was killed, minutes
+            # later, if a cable was out meanwhile: after those of the next connection.
+            limit = round(1000 * CONNECTING)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, limit)
         self._refused = ""
         try:
             self._socket.connect(address)

@@ -20,6 +20,7 @@ from petrobot import Ports, check_driver, rehearse
 from petrobot.services.adapters.opcua.actions import handshake, write
 from petrobot.services.adapters.opcua.session import OpcUaSession, _Notifications
 from petrobot.services.comm.protocol.plain import plain
+from tests.adapters.conftest import SmallRelay
 from tests.ports import free_ports
 from tests.waiting import Limit
 
@@ -244,6 +245,21 @@ def test_a_stop_that_a_frozen_server_has_not_taken_is_repeated(cell: Cell) -> No
     cell.power(True)
     await_(driver, lambda state: state["values"].get("count") == 7, "count = 7")
     assert driver.stopped()
+
+
+@pytest.mark.processes
+def test_a_write_over_a_lost_link_never_comes_late(cell: Cell, relay: SmallRelay) -> None:
+    """Else a server would get it after `on_stop`, which the next session writes."""
+    cell.power(True)
+    relay.begin(cell.port)
+    driver = cell.driver(url=f"opc.tcp://127.0.0.1:{relay.port}", patience=1.0)
+    await_(driver, complete, "all values")
+    relay.stall()
+    driver.command(0.0, {"write": {"manner": 30_000 * "x" + "last"}})
+    await_(driver, lambda state: not state["up"], "the loss")
+    driver.close()
+    received = relay.read()
+    assert b"xxx" in received and b"last" not in received
 
 
 @pytest.mark.processes

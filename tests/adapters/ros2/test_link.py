@@ -17,6 +17,7 @@ import pytest
 from petrobot.services.adapters.ros2 import bridge as bridge_module
 from petrobot.services.adapters.ros2.bridge import Bridge, ExchangePhase
 from petrobot.services.comm.protocol.plain import plain
+from tests.adapters.conftest import SmallRelay
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_actions import Ports
 from tests.ports import free_ports
@@ -161,6 +162,20 @@ RUBBISH = [
     '{"op": "fragment", "id": "0", "data": "x", "num": 0, "total": 2}',
     '{"op": "png", "data": "iVBO"}',
 ]
+
+
+def test_a_goal_over_a_lost_link_never_comes_late(fake: FakeProcess, relay: SmallRelay) -> None:
+    """Else the server would begin it after the next link has cancelled it."""
+    relay.begin(fake.port)
+    bridge = bridge_to(f"ws://127.0.0.1:{relay.port}", heartbeat=1.0)
+    bridge.until(lambda: bridge.connected, "the connection")
+    relay.stall()
+    message = {"text": 30_000 * "x"}
+    bridge.command(time.monotonic(), {"publish": {"topic": "/t", "type": "a/B", "msg": message}})
+    bridge.until(lambda: not bridge.connected, "the loss")
+    bridge.close()
+    received = relay.read()
+    assert 1000 < len(received) < 30_000  # masked: its words cannot be read
 
 
 def test_invalid_messages_change_nothing(bridge: Stepped, fake: FakeProcess) -> None:
