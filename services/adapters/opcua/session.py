@@ -219,8 +219,6 @@ class OpcUaSession(Driver):
     async def _serve(self, session: SessionThread) -> None:
         """One session."""
         from asyncua import Client
-        from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
-        from asyncua.crypto.uacrypto import CertProperties
 
         client = Client(self.url, timeout=self.patience)
         client.application_uri = self.application_uri or "urn:petrobot"
@@ -228,6 +226,22 @@ class OpcUaSession(Driver):
         if self.user:
             client.set_user(self.user)
             client.set_password(self._password)
+        try:
+            await self._connect(client)
+            try:
+                await self._serve_session(client, session)
+            except (TimeoutError, ConnectionError):
+                _abort(client)  # a frozen server would not answer the goodbye either
+                raise
+            finally:
+                await client.disconnect()
+        finally:
+            _abort(client)
+
+    async def _connect(self, client: Any) -> None:
+        from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+        from asyncua.crypto.uacrypto import CertProperties
+
         try:
             if self._keys:
                 own, secret, server = (CertProperties(*file[1:]) for file in self._keys.values())
@@ -239,16 +253,6 @@ class OpcUaSession(Driver):
             if why := await self._refusal(fault):
                 raise ConnectionError(why) from fault
             raise
-        try:
-            await self._serve_session(client, session)
-        except (TimeoutError, ConnectionError):
-            # A frozen server would not answer the goodbye either. asyncua may already take
-            # itself for disconnected, and then leaves this socket open.
-            if (protocol := client.uaclient.protocol) and protocol.transport:
-                protocol.transport.abort()
-            raise
-        finally:
-            await client.disconnect()
 
     async def _refusal(self, fault: Exception) -> str:
         """Return why the server gives no session, and by which key; empty if it is just away."""
@@ -348,6 +352,13 @@ async def _kind(node: Any) -> Any:
             return kind
     found = (await node.read_data_value(raise_on_bad_status=False)).Value
     return None if found is None or found.Value is None else found.VariantType
+
+
+def _abort(client: Any) -> None:
+    """Close the client's socket. asyncua leaves it open when it is cancelled, or when it already
+    takes itself for disconnected."""
+    if (protocol := client.uaclient.protocol) and protocol.transport:
+        protocol.transport.abort()
 
 
 class _Notifications:

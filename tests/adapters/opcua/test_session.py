@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import gc
 import ipaddress
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -22,7 +25,7 @@ from petrobot.services.adapters.opcua.session import OpcUaSession, _Notification
 from petrobot.services.comm.protocol.plain import plain
 from tests.adapters.conftest import SmallRelay
 from tests.ports import free_ports
-from tests.waiting import Limit
+from tests.waiting import PATIENCE_S, Limit
 
 PLC = Path(__file__).with_name("plc.py")
 NAMES = ("request", "done", "sensor", "count", "speed", "manner", "level")
@@ -541,3 +544,22 @@ def test_a_node_without_a_good_value_is_a_fault_of_its_name(cell: Cell) -> None:
     assert state["up"] and done(driver, {"speed": 2.5}) == ""
     state = await_(driver, lambda state: "speed" in state["values"], "a good value again")
     assert state["faults"] == {}
+
+
+@pytest.mark.processes
+def test_a_driver_that_is_closed_while_it_connects_leaves_no_socket_open(cell: Cell) -> None:
+    with socket.create_server(("127.0.0.1", cell.port)) as listener:
+        listener.settimeout(PATIENCE_S)
+        driver = cell.driver(patience=PATIENCE_S)
+        other, _ = listener.accept()
+        with other:
+            other.settimeout(PATIENCE_S)
+            assert other.recv(4) == b"HELF"
+            gc.disable()  # it would close the socket, at some time
+            try:
+                driver.close()
+                with contextlib.suppress(ConnectionResetError):
+                    while other.recv(1 << 16):
+                        pass
+            finally:
+                gc.enable()
