@@ -345,7 +345,7 @@ def _reasons(analysis: Analysis) -> Iterator[Told]:
         verdict = refused[name]
         details = list(verdict.details)
         if name == "deadlock_free" and lost is not None and lost.witness is not None:
-            details.append(f"no end can be reached any more after: {lost.witness.steps[-1]}")
+            details.append(f"`final` cannot be reached any more after: {lost.witness.steps[-1]}")
         if name in against and verdict.witness not in known:
             known.append(verdict.witness)
             details += path_lines(verdict.witness, "")
