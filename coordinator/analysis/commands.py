@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import hypot, isfinite, sqrt
+from math import hypot, isfinite, isnan, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -385,9 +385,13 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
         one, other = now.figures(), then.figures()
     except OutOfTime:
         one, other = {}, {}
-    rows += [(name, f"{one[name]:.6g}", f"{other[name]:.6g}") for name in one if name in other]
+    rows += [(name, _digits(one.get(name)), _digits(other.get(name))) for name in {**one, **other}]
     lines = [f"  {'':28}{'as it is':>14}{'what if':>14}"]
     return [*lines, *(f"  {name:28}{before:>14}{after:>14}" for name, before, after in rows)]
+
+
+def _digits(figure: float | None) -> str:
+    return "-" if figure is None or isnan(figure) else f"{figure:.6g}"
 
 
 def _subject(

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from math import sqrt
+from math import isnan, sqrt
 from typing import Any
 
 import numpy as np
@@ -917,7 +917,8 @@ def _growing(x: ExecutionGraph) -> PropertyVerdict:
 
 
 def _figures(figures: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {_share(value)}" for name, value in figures.items())
+    known = {name: value for name, value in figures.items() if not isnan(value)}
+    return ", ".join(f"{name} {_share(value)}" for name, value in known.items())
 
 
 def _share(value: float, decimals: int = 6) -> str:

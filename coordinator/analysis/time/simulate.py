@@ -233,7 +233,7 @@ class _Play:
         if not len(self.alive):
             return
         total = np.add.accumulate(amount, axis=0)
-        whole = total[-1]
+        whole = total[-1] if len(total) else np.zeros(len(self.alive))
         stay = np.zeros(len(self.alive))
         moving = tangible & (whole > 0)
         stay[moving] = self.random.standard_exponential(int(moving.sum())) / whole[moving]

@@ -380,9 +380,8 @@ class Forecast:
     def _goal_slopes(self) -> dict[str, Slope]:
         """Return the derivatives of the expected number of met goals, by transition."""
         chain, goals = self.chain, set(self.view.task.goal_transitions)
-        hits = np.array(
-            [self.view.origin.get(name) in goals for name in chain.gspn.net.transitions]
-        )[chain.label]
+        names = chain.gspn.net.transitions
+        hits = np.array([self.view.origin.get(name) in goals for name in names], bool)[chain.label]
         inside = self.transient[chain.source]
         value = np.where(inside & self.transient[chain.target], chain.probability, 0.0)
         gain = sum_by(chain.source, np.where(inside & hits, chain.probability, 0.0), chain.n)
