@@ -386,8 +386,8 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
     except OutOfTime:
         one, other = {}, {}
     rows += [(name, _digits(one.get(name)), _digits(other.get(name))) for name in {**one, **other}]
-    lines = [f"  {'':28}{'as it is':>14}{'what if':>14}"]
-    return [*lines, *(f"  {name:28}{before:>14}{after:>14}" for name, before, after in rows)]
+    lines = [f"  {'':30}{'as it is':>14}{'what if':>14}"]
+    return [*lines, *(f"  {name:30}{before:>14}{after:>14}" for name, before, after in rows)]
 
 
 def _digits(figure: float | None) -> str:

@@ -148,7 +148,7 @@ def test_a_task_without_transitions_has_figures(tokens: int, tmp_path: Path) -> 
         f'[places]\na = {{ kind = "control", tokens = {tokens} }}\n'
     )
     outcome = analyse_command(path, view="gspn", changes=[f"a={1 - tokens}"])
-    rows = {line[:30].strip(): line[30:].split() for line in outcome.text.splitlines()}
+    rows = {line[:32].strip(): line[32:].split() for line in outcome.text.splitlines()}
     one, other = ("0", "-") if tokens == 0 else ("-", "0")
     assert rows["mean time (s)"] == [one, other]
     assert rows["90 % quantile of the time (s)"] == [one, other]
