@@ -171,8 +171,7 @@ def analyse_command(
                 data |= {"what_if": what, "as_it_is": as_it_is}
                 said += ["", f"what if {', '.join(what)}:", *_compared(now, analyses[-1])]
             if expressions:
-                data["measures"], lines = _tell_measures(expressions, analyses)
-                said += lines
+                said += _tell_measures(expressions, analyses, data)
             times = ["time(0.9)"] * bool(wanted) + [one.text for one in expressions]
             notes += _unlike_missions(" ".join(times), analyses)
     except (NetFileError, ValueError, OverflowError) as error:
@@ -220,16 +219,16 @@ def _deadlines(limits: SearchLimits, analyses: int) -> list[tuple[float | None, 
 
 
 def _tell_measures(
-    measures: Sequence[UserMeasure], analyses: Sequence[Analysis]
-) -> tuple[dict[str, float], list[str]]:
-    """Return each measure of the user in the last analysis, and the lines that tell it in all.
+    measures: Sequence[UserMeasure], analyses: Sequence[Analysis], data: dict[str, Any]
+) -> list[str]:
+    """Add each measure of the user to the data, and return the lines that tell it in all analyses.
     Raises NetFileError."""
     rows = {one.name: _measure_values(one, analyses) for one in measures}
-    lines = [
-        f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
-        for name, values in rows.items()
-    ]
-    return {name: values[-1] for name, values in rows.items()}, ["", "measures:", *lines]
+    data["measures"] = {name: values[-1] for name, values in rows.items()}
+    if "as_it_is" in data:
+        data["as_it_is"]["measures"] = {name: values[0] for name, values in rows.items()}
+    lines = (f"  {name:28}{' -> '.join(map(_digits, values))}" for name, values in rows.items())
+    return ["", "measures:", *lines]
 
 
 def _unlike_missions(text: str, analyses: Sequence[Analysis]) -> tuple[str, ...]:

@@ -139,6 +139,13 @@ def test_nets_with_and_without_rates(tmp_path: Path) -> None:
         change_net(Net.build({"a": 1}, {}), [read_change("c=1")])
 
 
+def test_measures_of_the_file_as_it_is_are_in_the_data() -> None:
+    """The text has each measure before and after the change; so have the data."""
+    found = analyse_command(CATCH, view="gspn", changes=["runs=1"], measures=["p=time(0.9)"])
+    before, after = found.data["as_it_is"]["measures"]["p"], found.data["measures"]["p"]
+    assert f"{before:.6g} -> {after:.6g}" in found.text and after < before / 2
+
+
 @pytest.mark.parametrize("tokens", [0, 1])
 def test_a_task_without_transitions_has_figures(tokens: int, tmp_path: Path) -> None:
     """It is at its end, or never comes there: no traceback, and no time is `nan` or 4e-31 s."""

@@ -309,6 +309,17 @@ def test_other_durations_and_shares_are_forecast_as_they_then_come(
         assert found["figures"][name]["value"] == pytest.approx(truth[name], rel=0.03)
 
 
+def test_the_product_of_a_what_if_has_its_shares() -> None:
+    """It was that of the training, beside an R_conj with other faults."""
+    trained, asked = race(2000, np.random.default_rng(1)), [read_change("hold.error.share=0")]
+    found = forecast(loads(RACE, "race.toml"), trained, changes=asked)["product"]
+    late = [run for t in trained for run in t.runs if run.place == "hold"]
+    ends = [run.status == "success" for run in late if run.status != "error"]
+    assert np.mean(ends) > np.mean([run.status == "success" for run in late]) + 0.01
+    assert found["factors"]["hold"] == pytest.approx(np.mean(ends), abs=0.005)
+    assert found["R_conj"] == pytest.approx(np.prod([*found["factors"].values()]), abs=1e-5)
+
+
 def test_a_preempted_run_counts_in_the_product_as_its_arc_says() -> None:
     """A run that is always preempted when all went well has a reliability, too, not none."""
     trained = race(2000, np.random.default_rng(1))
