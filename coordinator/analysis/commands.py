@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import hypot, isfinite, sqrt
+from math import hypot, isfinite, isnan, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -171,8 +171,7 @@ def analyse_command(
                 data |= {"what_if": what, "as_it_is": as_it_is}
                 said += ["", f"what if {', '.join(what)}:", *_compared(now, analyses[-1])]
             if expressions:
-                data["measures"], lines = _tell_measures(expressions, analyses)
-                said += lines
+                said += _tell_measures(expressions, analyses, data)
             times = ["time(0.9)"] * bool(wanted) + [one.text for one in expressions]
             notes += _unlike_missions(" ".join(times), analyses)
     except (NetFileError, ValueError, OverflowError) as error:
@@ -220,16 +219,16 @@ def _deadlines(limits: SearchLimits, analyses: int) -> list[tuple[float | None, 
 
 
 def _tell_measures(
-    measures: Sequence[UserMeasure], analyses: Sequence[Analysis]
-) -> tuple[dict[str, float], list[str]]:
-    """Return each measure of the user in the last analysis, and the lines that tell it in all.
+    measures: Sequence[UserMeasure], analyses: Sequence[Analysis], data: dict[str, Any]
+) -> list[str]:
+    """Add each measure of the user to the data, and return the lines that tell it in all analyses.
     Raises NetFileError."""
     rows = {one.name: _measure_values(one, analyses) for one in measures}
-    lines = [
-        f"  {name:28}" + " -> ".join(f"{value:.6g}" for value in values)
-        for name, values in rows.items()
-    ]
-    return {name: values[-1] for name, values in rows.items()}, ["", "measures:", *lines]
+    data["measures"] = {name: values[-1] for name, values in rows.items()}
+    if "as_it_is" in data:
+        data["as_it_is"]["measures"] = {name: values[0] for name, values in rows.items()}
+    lines = (f"  {name:28}{' -> '.join(map(_digits, values))}" for name, values in rows.items())
+    return ["", "measures:", *lines]
 
 
 def _unlike_missions(text: str, analyses: Sequence[Analysis]) -> tuple[str, ...]:
@@ -385,9 +384,13 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
         one, other = now.figures(), then.figures()
     except OutOfTime:
         one, other = {}, {}
-    rows += [(name, f"{one[name]:.6g}", f"{other[name]:.6g}") for name in one if name in other]
-    lines = [f"  {'':28}{'as it is':>14}{'what if':>14}"]
-    return [*lines, *(f"  {name:28}{before:>14}{after:>14}" for name, before, after in rows)]
+    rows += [(name, _digits(one.get(name)), _digits(other.get(name))) for name in {**one, **other}]
+    lines = [f"  {'':30}{'as it is':>14}{'what if':>14}"]
+    return [*lines, *(f"  {name:30}{before:>14}{after:>14}" for name, before, after in rows)]
+
+
+def _digits(figure: float | None) -> str:
+    return "-" if figure is None or isnan(figure) else f"{figure:.6g}"
 
 
 def _subject(

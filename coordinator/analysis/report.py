@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from math import sqrt
+from math import isnan, sqrt
 from typing import Any
 
 import numpy as np
@@ -431,8 +432,13 @@ class Analysis:
             stuck = self.verdicts()["deadlock_free"].holds is False
             ends = self.progress.dead_ends if stuck else ()
             several = len(ends) > 1 or any(d.count > 1 for d in ends)
+            counts = Counter[str]()
+            for end in ends:
+                counts[end.verdict.reason] += end.count
             lines += [
-                f"  dead end       {d.count} x: {d.verdict.reason}" for d in ends[:SHOWN] if several
+                f"  dead end       {n} x: {reason}"
+                for reason, n in list(counts.items())[:SHOWN]
+                if several
             ]
             lines += _recovery_lines(self.progress.recoveries, self.odds)
         assumed = dict.fromkeys(  # a net of another tool is not executed
@@ -467,8 +473,8 @@ class Analysis:
         shown = {n: value for n, value in f.told.items() if n in ("R_goal", GOALS)}
         goal = f"{_figures(shown)}, " if shown else ""
         rows = [
-            f"  {w.place}.{w.action}: {100 * w.time_share:.1f} % of the time; error to success: "
-            f"{w.completion_gain:+.2e} complete, {w.goal_gain:+.3f} goals"
+            f"  {w.place}.{w.action}: 1 % shorter saves {w.time_share:.3f} % of the time; error to "
+            f"success: {w.completion_gain:+.3g} complete, {w.goal_gain:+.3g} goals"
             for w in f.worth[:SHOWN]
             if w.time_share >= LEAST_SHARE
             or abs(w.completion_gain) >= AGREE
@@ -777,7 +783,7 @@ def _forecast(
 
 
 LEAST_SHARE = 5e-4
-"""Least share of the time from which an action is worth improving: less is printed as 0.0 %."""
+"""Least share of the time from which an action is worth improving: less is printed as 0.000 %."""
 RARE = 1e-3
 """Shares below it are printed with six digits: six decimals would hide them."""
 AGREE = 1e-6
@@ -911,7 +917,8 @@ def _growing(x: ExecutionGraph) -> PropertyVerdict:
 
 
 def _figures(figures: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {_share(value)}" for name, value in figures.items())
+    known = {name: value for name, value in figures.items() if not isnan(value)}
+    return ", ".join(f"{name} {_share(value)}" for name, value in known.items())
 
 
 def _share(value: float, decimals: int = 6) -> str:
@@ -956,12 +963,14 @@ def _missing_lines(found: Analysis) -> list[str]:
     if not sound.holds and short <= CERTAIN:
         return [
             "P_complete is 1, but the task is not sound: by its numbers, what leads to a state "
-            "without an end never happens (a status has the share 0, or a time comes first)"
+            "without an end never happens (a status has the share 0, a time comes first, or a "
+            "condition is assumed to be true)"
         ]
     if short <= CERTAIN or not sound.holds:
         return []
+    less = f"{short:.3g} short of 1" if short < 0.5 else f"only {1 - short:.3g}"
     lines = [
-        f"sound, but P_complete is {short:.3g} short of 1: an end can always be reached, and not "
+        f"sound, but P_complete is {less}: an end can always be reached, and not "
         "every end is `final`. The rest of the probability goes to:"
     ]
     net, rest = found.forecast.view.task.net, missing(found.forecast)

@@ -213,7 +213,10 @@ def _told(found: Judgement, name: str) -> Iterator[Told]:
             known.add(finding.code)
             if notes[finding.code] > 1:
                 others = notes[finding.code] - 1
-                details.append(f"and {others} more such notes: petrobot check {name} --json -")
+                details.append(
+                    f"and {others} more such note{'s' * (others > 1)}: "
+                    f"petrobot check {name} --json -"
+                )
         yield Told(finding.severity, f"{place}{finding.key}: {finding.text}", details)
 
 
@@ -290,7 +293,8 @@ def _notes(name: str, analysis: Analysis) -> Iterator[Told]:
     for note in analysis.notes:
         yield Told(Severity.NOTE, note)
     if found := [verdict for verdict in analysis.by_hand if verdict.holds is False]:
-        more = [f"and {len(found) - 1} more such notes"] if len(found) > 1 else []
+        others = len(found) - 1
+        more = [f"and {others} more such note{'s' * (others > 1)}"] if others else []
         more.append(f"the way there: petrobot analyse {name}")
         yield Told(Severity.NOTE, f"only if the operator moves tokens: {found[0].reason}", more)
 
@@ -345,7 +349,7 @@ def _reasons(analysis: Analysis) -> Iterator[Told]:
         verdict = refused[name]
         details = list(verdict.details)
         if name == "deadlock_free" and lost is not None and lost.witness is not None:
-            details.append(f"no end can be reached any more after: {lost.witness.steps[-1]}")
+            details.append(f"`final` cannot be reached any more after: {lost.witness.steps[-1]}")
         if name in against and verdict.witness not in known:
             known.append(verdict.witness)
             details += path_lines(verdict.witness, "")

@@ -2,14 +2,15 @@
 
 A trial begins when a token leaves the runs place. A task that works on several tokens at a time has
 several trials at once, so what happens must be told to the trial whose token it moves. The engine's
-tokens carry no name: in an action place a token is its run, elsewhere the one that came first goes
-first. Tokens of the initial marking, such as resources, belong to no trial: a trial borrows them.
+tokens carry no name: in an action place a token is its run. Elsewhere a token of the trial whose
+run the firing takes goes first, else the one that came first. Tokens of the initial marking, such
+as resources, belong to no trial: a trial borrows them.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from petrobot.coordinator.engine.instructions import Finished, Fired, Marked
 from petrobot.coordinator.task import Kind, Status, Task
@@ -78,6 +79,7 @@ class TrialTokens:
             return self.begun
         index = self._net.transition_index[fired.transition]
         consumed, produced = dict(self._net.consume[index]), dict(self._net.produce[index])
+        beside = {self._runs[run] for run in fired.runs if run in self._runs}
         borrowed: list[int] = []
         trials: list[int] = []
         for place in consumed.keys() & produced.keys():  # only read, and runs go on
@@ -91,7 +93,7 @@ class TrialTokens:
         for place, weight in consumed.items():
             for _ in range(weight):
                 owed = place in self._lent and self._free[place] <= self._net.initial[place]
-                trial = self._take(place, fired.runs)
+                trial = self._take(place, fired.runs, beside)
                 if trial != NOBODY:
                     trials.append(trial)
                 elif owed:
@@ -117,12 +119,14 @@ class TrialTokens:
                 del self._live[done]
         return trial or self.begun
 
-    def _take(self, place: int, runs: Sequence[str] = ()) -> int:
-        """Take a token out of a place: that of one of these runs, or the first one of a trial, or
-        one of no trial. Return its trial."""
+    def _take(self, place: int, runs: Sequence[str] = (), beside: Collection[int] = ()) -> int:
+        """Take a token out of a place: that of one of these runs, or the first one of a trial (of
+        those `beside`, if it has one), or one of no trial. Return its trial."""
         waiting, name = self._waiting[place], self._net.places[place]
         known = [run for run in runs if run in self._runs and run.rpartition("#")[0] == name]
-        trial = self._runs.pop(known[0]) if known else waiting[0] if waiting else NOBODY
+        of_runs = [trial for trial in waiting if trial in beside]
+        first = next(iter(of_runs or waiting), NOBODY)
+        trial = self._runs.pop(known[0]) if known else first
         if trial == NOBODY:
             self._free[place] -= 1
             self._strayed[place] -= self._strayed[place] > 0

@@ -185,7 +185,7 @@ def test_a_task_that_loops_and_never_ends_is_refused(
     assert main(["check", str(path)]) == 2
     told = capsys.readouterr().out
     step = "stop_at_t ends in error -> stop_failed"
-    assert f"no end can be reached any more after: {step}\n" in told and "not sound" in told
+    assert f"`final` cannot be reached any more after: {step}\n" in told and "not sound" in told
 
 
 @pytest.mark.processes

@@ -200,6 +200,70 @@ def test_the_catching_task_in_one_analysis() -> None:
     )
 
 
+def pair(more: str, part: str = "") -> Task:
+    """Two jobs, each a run of `see` and one of `grip` side by side."""
+    ends = "success = { share = 0.9, mean = 1.0 }, error = { share = 0.1, mean = 1.0 }"
+    primitive = f'{{ goal = "g", deadline = 9.0, estimates = {{ {ends} }} }}'
+    text = (
+        'schema = 1\n[task]\nname = "t"\nfinal = "jobs == 0 and see == 0"\n'
+        f'runs_place = "jobs"\n{part}\n'
+        f"[primitive_tasks]\nsee = {primitive}\ngrip = {primitive}\n"
+        '[places]\njobs = { kind = "control", tokens = 2 }\nsee = { kind = "action" }\n'
+        'grip = { kind = "action" }\nbroken = {}\n[transitions]\n'
+        'go = { in = ["jobs", "!see", "!grip", "!broken"], out = ["see", "grip"] }\n'
+        'both = { in = ["see:normal", "grip:normal"] }\n'
+        'blind = { in = ["see:error", "grip:normal"] }\n'
+        'slip = { in = ["see:normal", "grip:error"] }\n'
+    )
+    return loads(text + more, "pair.toml")
+
+
+def test_dead_ends_with_one_reason_are_one_line() -> None:
+    """They differ only in the jobs that are still to do."""
+    lines = [one for one in analyse(pair("")).text().splitlines() if one.startswith("  dead end")]
+    assert len(lines) == 1 and "2 x: stuck with see (ended in error) grip" in lines[0]
+
+
+def test_an_improvement_that_changes_nothing_gains_exactly_nothing() -> None:
+    """Every job completes: the rounding of the solution is no gain."""
+    both = 'all = { in = ["see:error", "grip:error"] }\n'
+    found = analyse(pair(both), view="gspn")
+    assert found.forecast is not None
+    assert [w.completion_gain for w in found.forecast.worth] == [0.0, 0.0]
+    assert found.text().count("error to success: +0 complete") == 2
+
+
+def test_giving_up_after_a_further_error_is_named_where_only_it_is_left() -> None:
+    """After `see` has failed no path leads to `final`, but giving up is one error of `grip` away:
+    the words must not say that no end can be reached."""
+    give_up = 'all = { in = ["see:error", "grip:error"], out = ["broken"] }\n'
+    ways = pair(give_up, 'final_error = "broken == 1"')
+    blind = {n: t for n, t in ways.transitions.items() if n != "blind"}
+    task = replace(ways, transitions=blind)
+    sound = analyse(task).verdicts()["sound"]
+    assert sound.holds is False and sound.reason.endswith(
+        "no designed end can be reached without a further error or a stop"
+    )
+
+
+def test_a_condition_that_is_assumed_to_hold_explains_a_sure_completion() -> None:
+    """The task is stuck with the value `none`, the view assumes that one branch is always taken."""
+    text = (
+        'schema = 1\n[task]\nname = "t"\nfinal = "jobs == 0 and look == 0"\n'
+        '[primitive_tasks]\nlook = { goal = "g", deadline = 9.0, '
+        "estimates = { success = { share = 1.0, mean = 1.0 } } }\n"
+        '[variables]\nside = { type = "str", values = ["left", "right"] }\n'
+        '[places]\njobs = { kind = "control", tokens = 1 }\n'
+        'look = { kind = "action", out = { code = "side" } }\n[transitions]\n'
+        'go = { in = ["jobs"], out = ["look"] }\nbad = { in = ["look:error"] }\n'
+        "left = { in = ['look:normal'], when = \"side == 'left'\" }\n"
+    )
+    task = loads(text, "look.toml")
+    text = " ".join(analyse(task, view="gspn").text().split())
+    assert "P_complete is 1, but the task is not sound" in text
+    assert "or a condition is assumed to be true)" in text
+
+
 def test_the_forecast_of_a_task_is_consistent() -> None:
     """Firings per mission, conservation of runs, and the effect of moving probability from ERROR
     to SUCCESS."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
@@ -138,9 +139,33 @@ def test_nets_with_and_without_rates(tmp_path: Path) -> None:
         change_net(Net.build({"a": 1}, {}), [read_change("c=1")])
 
 
+def test_measures_of_the_file_as_it_is_are_in_the_data() -> None:
+    """The text has each measure before and after the change; so have the data."""
+    found = analyse_command(CATCH, view="gspn", changes=["runs=1"], measures=["p=time(0.9)"])
+    before, after = found.data["as_it_is"]["measures"]["p"], found.data["measures"]["p"]
+    assert f"{before:.6g} -> {after:.6g}" in found.text and after < before / 2
+
+
+@pytest.mark.parametrize("tokens", [0, 1])
+def test_a_task_without_transitions_has_figures(tokens: int, tmp_path: Path) -> None:
+    """It is at its end, or never comes there: no traceback, and no time is `nan` or 4e-31 s."""
+    path = tmp_path / "still.toml"
+    path.write_text(
+        'schema = 1\n[task]\nname = "t"\nfinal = "a == 0"\nruns_place = "a"\n'
+        f'[places]\na = {{ kind = "control", tokens = {tokens} }}\n'
+    )
+    outcome = analyse_command(path, view="gspn", changes=[f"a={1 - tokens}"])
+    rows = {line[:32].strip(): line[32:].split() for line in outcome.text.splitlines()}
+    one, other = ("0", "-") if tokens == 0 else ("-", "0")
+    assert rows["mean time (s)"] == [one, other]
+    assert rows["90 % quantile of the time (s)"] == [one, other]
+    assert "nan" not in outcome.text and "few phases:" not in outcome.text
+    seen = simulate_command(path, np.random.default_rng(1), replicas=20).data
+    assert seen["completed"][0] == 1 - tokens
+
+
 def test_simulation_accepts_the_same_changes() -> None:
     """Twice the runs take twice as long."""
-    import numpy as np
 
     def mean(*changes: str) -> float:
         random = np.random.default_rng(3)

@@ -126,7 +126,7 @@ def test_a_dead_end_is_told_in_short_lines(
     assert lines[first + 1 : first + 7] == [
         "error   deadlock free: stuck with parts: next needs arm, which is empty",
         "        arm: taken by `next`, never returned by `lost`",
-        "        no end can be reached any more after: look ends in error -> lost",
+        "        `final` cannot be reached any more after: look ends in error -> lost",
         "        by: the mission begins -> next",
         "            look ends in error -> lost",
         "        so it is not sound, live, proper, stable, controllable",

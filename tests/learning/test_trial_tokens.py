@@ -3,6 +3,7 @@ one after the other, for which a trial ends when the marking is as it was."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -236,6 +237,35 @@ def test_a_preempted_run_counts_in_its_trial_after_the_next_one_has_begun() -> N
     assert [end.cost for end in ends] == pytest.approx(costs, abs=0.01) and min(costs) > 0.9
 
 
+def by_hand(task: Task) -> tuple[TrialTokens, Callable[..., int]]:
+    """Two parts in the rack, and a function that fires a transition with these runs."""
+    tokens, net = TrialTokens(task), task.net
+    marking = [*net.initial]
+    marking[net.place_index["rack"]] = 2
+
+    def fire(transition: str, *runs: str) -> int:
+        before, index = tuple(marking), net.transition_index[transition]
+        for arcs, sign in ((net.consume, -1), (net.produce, 1)):
+            for place, weight in arcs[index]:
+                marking[place] += sign * weight
+        return tokens.fired(Fired(1, transition, before, tuple(marking), "stability", runs))
+
+    return tokens, fire
+
+
+def test_a_counter_beside_a_run_is_taken_with_its_own_run() -> None:
+    """The second part is done first. The token that came first is not its own: with it both parts
+    would count as one trial with two goals and one without any."""
+    text = PIPE.replace('["load"] }', '["load", "used"] }').replace(
+        "broken = {}", "broken = {}\nused = {}"
+    )
+    text = text.replace('holds = "hand" }', "servers = 2 }")
+    text = text.replace('["load:normal"]', '["load:normal", "used"]')
+    _, fire = by_hand(loads(text, "pipe.toml"))
+    assert [fire("start"), fire("start")] == [1, 2]
+    assert [fire("loaded", "load#2"), fire("loaded", "load#1")] == [2, 1]
+
+
 TRAY = """
 schema = 1
 [task]
@@ -265,18 +295,7 @@ changed = { in = ["change:normal"], out = ["trays"] }
 
 
 def test_a_run_that_a_firing_only_reads_stays_the_same_run() -> None:
-    task = loads(TRAY, "tray.toml")
-    tokens, net = TrialTokens(task), task.net
-    marking = [*net.initial]
-    marking[net.place_index["rack"]] = 2
-
-    def fire(transition: str, *runs: str) -> int:
-        before, index = tuple(marking), net.transition_index[transition]
-        for arcs, sign in ((net.consume, -1), (net.produce, 1)):
-            for place, weight in arcs[index]:
-                marking[place] += sign * weight
-        return tokens.fired(Fired(1, transition, before, tuple(marking), "stability", runs))
-
+    tokens, fire = by_hand(loads(TRAY, "tray.toml"))
     assert [fire("start"), fire("full"), fire("ready", "put#1")] == [1, 1, 1]
     assert fire("start") == 2 and tokens.of("put#2") == 2 and tokens.of("change#1") == 1
     assert [fire("changed", "change#1"), fire("ready", "put#2")] == [1, 2]

@@ -285,6 +285,7 @@ class Progress:
             return self._yes("an end can be reached from every state")
         first = int(lost[0])
         reason = f"from {left_over(x, first)} no designed end can be reached"
+        reason += " without a further error or a stop" * bool(tired[first])
         if x.dead.any() or x.livelocks:  # told by the verdict on deadlocks
             return self._no(reason, first)
         # Without a further error or a stop, a lost state leads to lost states only.

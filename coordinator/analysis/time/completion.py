@@ -113,9 +113,11 @@ class CompletionTime:
         return min(1.0, float(weight @ self.absorbed[k]) / self.probability)
 
     def quantile(self, q: float) -> float:
-        """Return the time t (s) with P(T <= t | complete) = q, 0 < q < 1."""
+        """Return the least time t (s) with P(T <= t | complete) >= q, 0 < q < 1."""
         if not 0 < q < 1:
             raise ValueError(f"quantile: expected 0 < q < 1, got {q}")
+        if self.absorbed[0] >= q * self.probability:
+            return 0.0
         low, high = 0.0, 1.0 / self.rate
         while self.cdf(high) < q:
             low, high = high, 2 * high

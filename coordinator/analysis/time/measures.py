@@ -93,7 +93,9 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
     }
     try:
         return float(evaluate(text, names))
-    except (ValueError, ZeroDivisionError) as error:
+    except ZeroDivisionError as error:
+        raise _fault(measure, "a division by 0", "divide by what is not 0 here") from error
+    except ValueError as error:
         raise _fault(measure, str(error), FORM) from error
 
 
@@ -118,5 +120,6 @@ def _number(measure: Measure, text: str, below: float) -> float:
     except ValueError as error:
         raise _fault(measure, f"expected a number, got {text!r}", FORM) from error
     if not 0.0 < value < below:
-        raise _fault(measure, f"{text} is out of range", "give more than 0")
+        end = "" if below == float("inf") else f" and less than {below:g}"
+        raise _fault(measure, f"{text} is out of range", f"give more than 0{end}")
     return value

@@ -59,8 +59,8 @@ class IntervalEstimate:
         middle, half = p + z * z / (2 * n), z * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
         return cls(
             p,
-            max(0.0, (middle - half) / (1 + z * z / n)),
-            min(1.0, (middle + half) / (1 + z * z / n)),
+            (middle - half) / (1 + z * z / n) if hits else 0.0,
+            (middle + half) / (1 + z * z / n) if hits < n else 1.0,
         )
 
     def covers(self, value: float) -> bool:
@@ -233,7 +233,7 @@ class _Play:
         if not len(self.alive):
             return
         total = np.add.accumulate(amount, axis=0)
-        whole = total[-1]
+        whole = total[-1] if len(total) else np.zeros(len(self.alive))
         stay = np.zeros(len(self.alive))
         moving = tangible & (whole > 0)
         stay[moving] = self.random.standard_exponential(int(moving.sum())) / whole[moving]

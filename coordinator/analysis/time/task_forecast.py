@@ -46,6 +46,8 @@ from petrobot.coordinator.task.wording import few
 
 SAME = 1e-9
 """Figures that differ by less are the same."""
+ROUNDING = 1e-12
+"""A derivative that is a smaller share of its figure is the rounding of the solution."""
 MATTERS = 0.01
 """Share of the time of a mission run, or of a figure, above which an error of a fit is reported."""
 GOALS = "goals per run"
@@ -75,12 +77,17 @@ def timer_shares(view: StochasticView, throughput: Mapping[str, float]) -> dict[
     }
 
 
+def _unrounded(derivative: float, figure: float) -> float:
+    return derivative if abs(derivative) > ROUNDING * figure else 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class Worth:
     """What an improvement of one action of a place would bring (exact derivatives).
 
     `time_share`: per cent of the mean mission time saved per per cent of its durations; the
-    bottleneck has the largest. `completion_gain`, `goal_gain`: change of P_complete and of the
+    bottleneck has the largest. The sum may exceed 1: fewer
+    events come during shorter runs. `completion_gain`, `goal_gain`: change of P_complete and of the
     expected met goals per unit of probability moved from ERROR to SUCCESS (0 if it never ends with
     ERROR).
     """
@@ -322,11 +329,10 @@ class Forecast:
             whole = -sum(time[name].elasticity for name in self._phases(place))
             share = self._use(keys)
             for key in keys:
-                found.append(
-                    Worth(
-                        *key, whole * share[key], self._move(key, complete), self._move(key, goals)
-                    )
-                )
+                time_share = _unrounded(whole * share[key], 1.0)
+                gain = _unrounded(self._move(key, complete), self.completion_probability)
+                met = _unrounded(self._move(key, goals), self.goals or 1.0)
+                found.append(Worth(*key, time_share, gain, met))
         return tuple(sorted(found, key=lambda w: -w.time_share))
 
     def _phases(self, place: str) -> list[str]:
@@ -374,9 +380,8 @@ class Forecast:
     def _goal_slopes(self) -> dict[str, Slope]:
         """Return the derivatives of the expected number of met goals, by transition."""
         chain, goals = self.chain, set(self.view.task.goal_transitions)
-        hits = np.array(
-            [self.view.origin.get(name) in goals for name in chain.gspn.net.transitions]
-        )[chain.label]
+        names = chain.gspn.net.transitions
+        hits = np.array([self.view.origin.get(name) in goals for name in names], bool)[chain.label]
         inside = self.transient[chain.source]
         value = np.where(inside & self.transient[chain.target], chain.probability, 0.0)
         gain = sum_by(chain.source, np.where(inside & hits, chain.probability, 0.0), chain.n)

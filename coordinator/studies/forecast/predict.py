@@ -145,7 +145,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "same": training.same,
         "runs": request.runs,
         **found,
-        "product": product_rule(training, request.choices),
+        "product": product_rule(training, request),
         "dependence": dependences(training),
         **(_by_place(training, request.choices) if repeats else {"routing": {}}),
         "choice_runs": {name: sum(actions.values()) for name, actions in counts.items()},
@@ -497,10 +497,11 @@ class _SimulatedNet:
         return {name: np.array(values) for name, values in found.items()}
 
 
-def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
+def product_rule(training: Training, request: Request) -> dict[str, Any]:
     """Return the product of reliabilities over the places of the normal flow: R_conj of a series,
     if all were independent."""
-    names, runs = training.vocabulary, training.runs
+    names, choices = training.vocabulary, request.choices
+    runs = changed(training, training.runs, request.changes)
     status, _ = names.parts(runs.outcome)
     normal = [q for q, p in enumerate(names.places) if p not in training.task.flat.error_elements]
     value, factors = 1.0, {}
@@ -515,7 +516,9 @@ def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
             )
             if own.any():
                 r, whole = (
-                    r + probability * float(np.mean(status[own] == SUCCESS)),
+                    r
+                    + probability
+                    * float(np.average(status[own] == SUCCESS, weights=runs.weight[own])),
                     whole + probability,
                 )
         if whole:

@@ -295,11 +295,11 @@ def order_doubts(training: Training) -> list[str]:
     ):
         # Trials of one mission run may be alike; that is a design effect, not an order.
         values = _means(each, own)
-        if len(values) < 20 or values.std() == 0:
+        if len(values) < 20 or not np.ptp(values):  # `std` of a constant may be 1e-18
             continue
         order = np.arange(len(values), dtype=np.float64)
         tests = [("changes with the order of the trials", order, values)]
-        if values[1:].std() > 0 and values[:-1].std() > 0:
+        if np.ptp(values[1:]) and np.ptp(values[:-1]):
             tests.append(("depends on the trial before", values[:-1], values[1:]))
         for words, one, other in tests:
             found.append((f"{name} {words}", *_rank_test(one, other)))
@@ -483,7 +483,8 @@ def parallel_doubts(training: Training) -> list[str]:
         for p, q in combinations_with_replacement(entered, 2)
         if (p, q) not in never and (p != q or p in several)
     ]
-    more = f" (as {len(together) - 1} more pairs of places)" * (len(together) > 1)
+    others = len(together) - 1
+    more = f" (as {others} more pair{'s' * (others > 1)} of places)" * (others > 0)
     return [
         (f"several runs of {net.places[p]}" if p == q else f"{net.places[p]} and {net.places[q]}")
         + f" may be active at the same time{more}, and an estimates file does not tell whether "

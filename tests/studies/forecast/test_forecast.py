@@ -3,6 +3,7 @@ dependence, which the product rule does not."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -307,6 +308,27 @@ def test_other_durations_and_shares_are_forecast_as_they_then_come(
         assert found["figures"][name]["value"] == pytest.approx(truth[name], abs=0.015)
     for name in ("mean", "q90"):
         assert found["figures"][name]["value"] == pytest.approx(truth[name], rel=0.03)
+
+
+def test_trials_that_are_all_alike_depend_on_no_order() -> None:
+    """A forecast of constant times printed warnings of a division by 0 and tested with nan."""
+    one = next(t for t in race(50, np.random.default_rng(1)) if t.all_success)
+    alike = [replace(one, time=0.012)] * 300
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = forecast(loads(RACE, "race.toml"), alike)
+    assert found["figures"]["mean"]["value"] == pytest.approx(0.012) and not found["doubts"]
+
+
+def test_the_product_of_a_what_if_has_its_shares() -> None:
+    """It was that of the training, beside an R_conj with other faults."""
+    trained, asked = race(2000, np.random.default_rng(1)), [read_change("hold.error.share=0")]
+    found = forecast(loads(RACE, "race.toml"), trained, changes=asked)["product"]
+    late = [run for t in trained for run in t.runs if run.place == "hold"]
+    ends = [run.status == "success" for run in late if run.status != "error"]
+    assert np.mean(ends) > np.mean([run.status == "success" for run in late]) + 0.01
+    assert found["factors"]["hold"] == pytest.approx(np.mean(ends), abs=0.005)
+    assert found["R_conj"] == pytest.approx(np.prod([*found["factors"].values()]), abs=1e-5)
 
 
 def test_a_preempted_run_counts_in_the_product_as_its_arc_says() -> None:
