@@ -48,14 +48,19 @@ def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float],
 
 
 @contextmanager
-def kept_streams() -> Iterator[None]:
-    """Give back the standard output and error that an action has closed or replaced: in lock step
-    actions run in this process, and the result is still to be printed."""
+def kept_streams(apart: bool) -> Iterator[None]:
+    """Give back the standard output and error that code of users has closed or replaced: in lock
+    step it runs in this process, and the result is still to be printed. `apart`: what it prints
+    goes to standard error, since a program reads the output."""
     streams, copies = (sys.stdout, sys.stderr), dict[int, int]()
     for number in (1, 2):
         with suppress(OSError):  # closed from the start
             copies[number] = os.dup(number)
     try:
+        if apart:
+            sys.stdout.flush()
+            sys.stdout = sys.stderr
+            os.dup2(2, 1)
         yield
     finally:
         for number, copy in copies.items():

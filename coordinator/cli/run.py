@@ -301,7 +301,7 @@ def conduct(
     make: Callable[[Sequence[Observer]], RunSession], options: argparse.Namespace, mode: str
 ) -> int:
     """Make a session, lead it to its end, print and write its result. Return the exit code."""
-    from petrobot.coordinator.cli.output import give
+    from petrobot.coordinator.cli.output import give, kept_streams
     from petrobot.coordinator.launch import RequestError
     from petrobot.coordinator.learning.estimates_file import EstimatesError
     from petrobot.coordinator.operator.session import interruptible
@@ -319,12 +319,13 @@ def conduct(
     timeline = None if options.report is None else Timeline()  # it grows with the run
 
     async def lead() -> None:
-        with interruptible():  # importing a simulated cell may take seconds
-            made.append(make([] if timeline is None else [timeline]))
-            store = made[0].mission.executor.store
-            if timeline is not None and isinstance(store, JournalStore):
-                timeline.origin = store.origin  # its times are those of `petrobot log`
-        await (_lead_lockstep if mode == "lockstep" else _lead_realtime)(made[0], options)
+        with kept_streams(options.json == "-") if mode == "lockstep" else nullcontext():
+            with interruptible():  # importing a simulated cell may take seconds
+                made.append(make([] if timeline is None else [timeline]))
+                store = made[0].mission.executor.store
+                if timeline is not None and isinstance(store, JournalStore):
+                    timeline.origin = store.origin  # its times are those of `petrobot log`
+            await (_lead_lockstep if mode == "lockstep" else _lead_realtime)(made[0], options)
 
     try:
         asyncio.run(lead())
@@ -359,9 +360,9 @@ def conduct(
 
 
 async def _lead_lockstep(session: RunSession, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.cli.output import kept_streams, progress
+    from petrobot.coordinator.cli.output import progress
 
-    with progress(options) as watch, kept_streams():
+    with progress(options) as watch:
         await session.lead(watch)
 
 

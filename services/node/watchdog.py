@@ -2,9 +2,6 @@
 for ever, and in the services that a node executes in its own loop, where the node would answer
 nobody. There is no other process that could end it.
 
-Code that changes the working folder of this process would let the command, or the node, look for
-its files elsewhere: it is changed back after the step.
-
 Code that ends this process would end the command, or the node, without a word. `os._exit` raises
 SystemExit there instead, and Python names the line at a crash.
 
@@ -27,7 +24,7 @@ import weakref
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from petrobot.services.worker.callables import is_users
 from petrobot.services.worker.runner import Execution, Hung
@@ -52,7 +49,7 @@ ENDING = (signal.SIGALRM, signal.SIGVTALRM, signal.SIGPROF)
 """Signals of a process's timers, which end it by default."""
 UNWATCHED: AbstractContextManager[None] = nullcontext()
 """Stands for a watchdog where none is needed."""
-_exit, _chdir = os._exit, os.chdir
+_exit = os._exit
 _raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
@@ -63,7 +60,7 @@ class Watchdog:
     def __init__(self, node: str, slow: float = LIMIT) -> None:
         """A step that takes longer than `slow` s is logged."""
         self._node, self._slow = node, slow
-        self._logged = self._moved = False
+        self._logged = False
         self._step = 0
         """Odd during a step."""
         self._thread: threading.Thread | None = None
@@ -93,12 +90,6 @@ class Watchdog:
         """Note that the code has returned."""
         self._step += 1
         _steps.clear()
-        if _left:
-            if not self._moved:
-                text = "node %s: its code changed the working folder, which was changed back"
-                _log.warning(text, self._node)
-            self._moved = True
-            _chdir(_left.pop())
 
     def close(self) -> None:
         """Stop watching."""
@@ -160,19 +151,8 @@ def _exit_aloud(status: int) -> NoReturn:
     _exit(status)
 
 
-_left: list[Path] = []
-"""The working folder of this process, if the code of a step has left it."""
-
-
-def _chdir_noted(path: Any) -> None:
-    """Stands for `os.chdir`."""
-    if not _left and _steps.get(os.getpid()) == threading.get_ident():
-        _left.append(Path.cwd())
-    _chdir(path)
-
-
 def _name_what_ends_the_process() -> None:
-    os._exit, os.chdir = _exit_aloud, _chdir_noted
+    os._exit = _exit_aloud
     if not faulthandler.is_enabled() and sys.stderr is sys.__stderr__ is not None:
         faulthandler.enable(all_threads=False)
         for number in ENDING:

@@ -12,6 +12,7 @@ from typing import Any, cast
 import pytest
 
 from petrobot import Driver, rehearse
+from tests.waiting import Limit
 
 
 class PortsClock(Driver):
@@ -75,7 +76,8 @@ class SmallRelay:
             with selectors.DefaultSelector() as ready:
                 ready.register(near, selectors.EVENT_READ, far)
                 ready.register(far, selectors.EVENT_READ, near)
-                while not self._stalled.is_set():
+                limit = Limit("the stall")
+                while not self._stalled.is_set() and limit.left():
                     for found, _ in ready.select(0.02):
                         cast(socket.socket, found.data).sendall(found.fileobj.recv(4096))  # type: ignore[union-attr]
             self._over.wait(60.0)

@@ -765,6 +765,21 @@ def test_the_result_is_given_although_an_action_takes_output_or_folder_away(
 
 
 @pytest.mark.processes
+def test_what_code_of_users_prints_is_not_in_the_json(tmp_path: Path) -> None:
+    """In lock step it runs in the process of the command."""
+    assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0
+    code = tmp_path / "bot" / "bot.py"
+    said = '    import os; print("moves"); os.system("echo runs")\n'
+    head, move, body = code.read_text(encoding="utf-8").partition("async def move(")
+    signature, end, rest = body.partition("-> Result:\n")
+    text = head + move + signature + end + said + rest
+    code.write_text(text.replace("\nclass ", '\nprint("read")\n\n\nclass ', 1), encoding="utf-8")
+    done = petrobot("run", "bot/bot.toml", "--mode", "lockstep", "--json", "-", cwd=tmp_path)
+    assert json.loads(done.stdout)["status"] == "success", done
+    assert all(word in done.stderr for word in ("moves", "runs", "read"))
+
+
+@pytest.mark.processes
 def test_a_run_without_its_score_has_its_result_and_a_resume_asks_again(tmp_path: Path) -> None:
     """The node that scores may have died: of such a run, only one line was left."""
     assert petrobot("new", "robot", "bot", cwd=tmp_path).returncode == 0

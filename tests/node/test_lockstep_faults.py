@@ -288,18 +288,17 @@ def test_an_ended_thread_does_not_crash_the_watchdog() -> None:
 
 
 @pytest.mark.processes
-def test_code_that_changes_the_working_folder(tmp_path: Path) -> None:
+def test_a_driver_that_changes_the_working_folder(tmp_path: Path) -> None:
     """In lock step it runs in the process of the command, whose files must come where they were
     asked for."""
     (elsewhere := tmp_path / "elsewhere").mkdir()
 
-    def petrobot(folder: Path, *words: str) -> str:
+    def petrobot(folder: Path, *words: str) -> None:
         command = [sys.executable, "-m", "petrobot.coordinator", *words]
         done = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False
         )
         assert done.returncode == 0, done
-        return done.stderr
 
     petrobot(tmp_path, "new", "robot", "carrier")
     robot = tmp_path / "carrier"
@@ -315,7 +314,6 @@ def test_code_that_changes_the_working_folder(tmp_path: Path) -> None:
         text.replace("\nfrom petrobot", "\nimport os\nfrom petrobot", 1)
     )
     asked = ("--mode", "lockstep", "--journal", "runs", "--json", "out.json")
-    told = petrobot(robot, "run", "carrier.toml", *asked)
-    assert told.count("changed the working folder") == 1
+    petrobot(robot, "run", "carrier.toml", *asked)
     assert (robot / "out.json").exists() and [*(robot / "runs").glob("*/result.json")]
     assert not [*elsewhere.iterdir()]
