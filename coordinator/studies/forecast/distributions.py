@@ -297,7 +297,7 @@ def _trend(runs: Runs) -> Trend | None:
     best: Trend | None = None
     strongest, n = SURE, len(runs)
     for place, earlier in enumerate(runs.seen.took):
-        if n < LEAST // 2 or np.isnan(earlier).any() or not np.ptp(earlier) or not np.ptp(runs.took):
+        if n < LEAST // 2 or np.isnan(earlier).any() or not (np.ptp(earlier) and np.ptp(runs.took)):
             continue
         slope = float(np.cov(earlier, runs.took)[0, 1] / earlier.var(ddof=1))
         left = float(np.var(runs.took - slope * earlier)) * n / (n - 2)
