@@ -1113,7 +1113,8 @@ def _probability(p: float) -> str:
 
 
 def heat(found: Forecast) -> dict[str, float]:
-    """Return the share of the time that each place takes, 0 to 1, to colour a drawing."""
+    """Return what a shorter time in each place saves of the whole (1: as much), 0 to 1, to colour a
+    drawing."""
     shares: dict[str, float] = {}
     for w in found.worth:
         shares[w.place] = shares.get(w.place, 0.0) + w.time_share

@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--heat",
         action="store_true",
-        help="colour the action places by their share of the mean time",
+        help="colour the action places by what a shorter time there saves",
     )
     parser.add_argument(
         "--out",
@@ -148,7 +148,7 @@ def _gspn(options: argparse.Namespace) -> str:
 
 
 def _heat(task: Task, options: argparse.Namespace) -> Overlay:
-    """Return an overlay of each action place's share of the mean time, as forecast. Raises
+    """Return an overlay of what a shorter time in each action place saves, as forecast. Raises
     CommandError."""
     from petrobot.coordinator.analysis.limits import OutOfTime
     from petrobot.coordinator.analysis.may_run import assumed, devices_of
@@ -176,8 +176,8 @@ def _heat(task: Task, options: argparse.Namespace) -> Overlay:
     count = {source: len(names) for source, names in sources}
     measured = sum(n for source, n in count.items() if source.startswith("measured"))
     told = (
-        f"Warm: share of the mean time by the forecast; the bottleneck is {most} with "
-        f"{100 * shares[most]:.0f} % ({'; '.join(own)}). {measured} of {sum(count.values())} "
+        f"Warm: what 1 % less time there saves, by the forecast; the bottleneck is {most}: "
+        f"{shares[most]:.2f} % ({'; '.join(own)}). {measured} of {sum(count.values())} "
         f"numbers are measured. Assumed: {assumed(cell)}."
     )
     return Overlay(heat=shares, legend=told)
