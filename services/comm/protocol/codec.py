@@ -39,6 +39,7 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.plain import (
     LARGEST,
     MAX_CONTAINERS,
+    MOST_VALUES,
     SCALARS,
     NotPlainError,
     inspect,
@@ -258,7 +259,7 @@ MAX_VALUES = 1 << 17
 Together with the limit of bytes it bounds how long other callers wait while one message is decoded:
 about 30 ms at worst.
 """
-MAX_VALUES_OF_OUTCOME = 1 << 19
+MAX_VALUES_OF_OUTCOME = MOST_VALUES
 """The same for a result, since the score of a long mission run is one. The worst that was tried
 takes a node 40 ms from its worker to the caller, and the caller 25 ms (2-core PC)."""
 ENTRY = 6

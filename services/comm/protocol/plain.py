@@ -23,7 +23,9 @@ DEPTH = 32
 """Deepest nesting of plain data."""
 
 LARGEST = 16 << 20
-"""Size of the largest message (bytes): nothing in it has more items or characters."""
+"""Size of the largest message (bytes)."""
+MOST_VALUES = 1 << 19
+"""Most values in a message of the kind that may have most of them (a result)."""
 MAX_CONTAINERS = 20_000
 """Most arrays and maps in one message. Each takes one byte on the wire, but about 70 bytes in
 memory."""
@@ -94,8 +96,8 @@ def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
     if depth == 0:
         raise NotPlainError(f"{where}: nested deeper than {DEPTH} levels; flatten it")
     left[0] -= 1
-    if left[0] < 0 or len(value) > LARGEST:
-        most = f"{MAX_CONTAINERS:,} lists and dicts" if left[0] < 0 else f"{LARGEST:,} items"
+    if left[0] < 0 or len(value) > MOST_VALUES:
+        most = f"{MAX_CONTAINERS:,} lists and dicts" if left[0] < 0 else f"{MOST_VALUES:,} items"
         raise NotPlainError(f"{where}: more than {most}; store them in a file and give its name")
     return (
         _plain_dict(value, where, depth, left)
@@ -114,7 +116,13 @@ def _plain_dict(
         kind = type(item)
         if kind in _SIMPLE or (kind is int and -_INT64 <= item < _INT64):
             copy[key] = item  # as `_plain`, without building the name of the position
-        elif kind in _ROWS and depth > 1 and left[0] > 0 and _SIMPLE.issuperset(map(type, item)):
+        elif (
+            kind in _ROWS
+            and depth > 1
+            and left[0] > 0
+            and len(item) <= MOST_VALUES
+            and _SIMPLE.issuperset(map(type, item))
+        ):
             left[0] -= 1
             copy[key] = [*item]  # simple values: one copy without a look at each
         else:
