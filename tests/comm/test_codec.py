@@ -28,6 +28,7 @@ from petrobot.services.comm.protocol.codec import (
 from petrobot.services.comm.protocol.messages import Executed
 from petrobot.services.comm.protocol.plain import (
     DEPTH,
+    MOST_VALUES,
     NotPlainError,
     pack_array,
     plain,
@@ -437,8 +438,13 @@ def test_plain_copies_and_simplifies() -> None:
             {"p": 2**64},
             "arguments.p: the integer 18446744073709551616 does not fit in 64 bits; use a",
         ),
+        ({"p": [1, 2.0, -(2**63) - 1]}, "arguments.p[2]: the integer -9223372036854775809 does"),
+        ({"p": [[1, 2**64, None]]}, "arguments.p[0][1]: the integer 18446744073709551616 does"),
         ({"p": _nested(DEPTH + 1)}, f"nested deeper than {DEPTH} levels"),
+        ({"p": [0.0] * (MOST_VALUES + 1)}, "arguments.p: more than 524,288 items; store them"),
+        ({"p": [[1] * (MOST_VALUES + 1)]}, "arguments.p[0]: more than 524,288 items; store them"),
     ],
+    ids=lambda value: "" if isinstance(value, dict) else value[:40],
 )
 def test_plain_names_the_fault_and_its_position(value: Any, says: str) -> None:
     with pytest.raises(NotPlainError) as fault:

@@ -121,7 +121,7 @@ def _plain_dict(
             and depth > 1
             and left[0] > 0
             and len(item) <= MOST_VALUES
-            and _SIMPLE.issuperset(map(type, item))
+            and (_SIMPLE.issuperset(map(type, item)) or _fits(item))
         ):
             left[0] -= 1
             copy[key] = [*item]  # simple values: one copy without a look at each
@@ -137,9 +137,17 @@ def _shown(key: Any) -> str:
 
 
 def _plain_list(value: Sequence[Any], where: str, depth: int, left: list[int]) -> list[Any]:
-    if _SIMPLE.issuperset(map(type, value)):
+    if _SIMPLE.issuperset(map(type, value)) or _fits(value):
         return list(value)
     return [_plain(item, f"{where}[{index}]", depth - 1, left) for index, item in enumerate(value)]
+
+
+def _fits(value: Sequence[Any]) -> bool:
+    """Whether all items are simple or integers of 64 bits, of which there is at least one."""
+    if not SCALARS.issuperset(map(type, value)):
+        return False
+    integers = [item for item in value if type(item) is int]
+    return min(integers) >= _INT_MIN and max(integers) <= _INT_MAX
 
 
 def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
