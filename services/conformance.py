@@ -16,7 +16,7 @@ import threading
 import time
 import traceback
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial, wraps
@@ -61,6 +61,8 @@ ALWAYS = 5, 0.8
 EQUAL = 20, 0.1
 """So does one that waits so often, and always for the same time: without the tenth at each end, its
 waits differ by at most this share. A busy computer delays by any time."""
+STRETCH = 5.0
+"""So many times as long may a wait last in which too few steps are made."""
 LEAVING = 2.0
 """Seconds in which the threads and processes of a closed driver must end."""
 HELD = 3
@@ -388,10 +390,20 @@ class _Check:
         positions: Mapping[str, float] | None = None,
     ) -> set[str]:
         """Step for `seconds`; return the positions that changed by more than at rest."""
-        begin, drifted, end = self.numbers(), set[str](), self.now() + seconds
-        while self.now() < end and not until():
-            drifted |= _differ(begin, self.step(), positions or {}, PLAY)
+        begin, drifted, steps = self.numbers(), set[str](), self.stepped(seconds)
+        while not until() and (numbers := next(steps, None)) is not None:
+            drifted |= _differ(begin, numbers, positions or {}, PLAY)
         return drifted
+
+    def stepped(self, seconds: float) -> Iterator[dict[str, float]]:
+        """Step for `seconds`, and on a busy computer until as many steps are made as fit into
+        them; yield the numbers of the state after each."""
+        started, missing = self.now(), round(seconds / self.period)
+        while (lasted := self.now() - started) < seconds or (
+            missing > 0 and lasted < STRETCH * seconds
+        ):
+            missing -= 1
+            yield self.step()
 
     def rules(
         self, commands: Sequence[Command], seconds: float, cable: Callable[[bool], None] | None
@@ -845,12 +857,10 @@ class _Check:
     def drifts(self, positions: Mapping[str, float]) -> set[str]:
         """Step for a while; return the positions that change by more than at rest, or slowly and
         steadily: what only settles becomes slower."""
-        points, end = [self.numbers()], self.now() + max(self.within, REST * self.period)
-        while self.now() < end:
-            points.append(self.step())
+        points = [self.numbers(), *self.stepped(max(self.within, REST * self.period))]
         drifted = {n for point in points for n in _differ(points[0], point, positions, PLAY)}
         for name in positions:
-            places = [point[name] for point in points[:: len(points) // 4] if name in point]
+            places = [point[name] for point in points[:: max(1, len(points) // 4)] if name in point]
             ways = sorted((_change(before, after) for before, after in pairwise(places)), key=abs)
             least = max(CREEP * positions[name], self.idle.get(name, 0.0))
             if len(ways) > 3 and all(way / ways[-1] > 0.5 for way in ways if abs(way) > least):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import itertools
 import math
 import os
 import random
@@ -208,6 +209,33 @@ class Settles(Axis):
 
 def test_an_axis_may_settle_after_the_movement() -> None:
     assert checked(Settles).faults == []
+
+
+class Brakes(Axis):
+    """Needs eight steps to stand still."""
+
+    def stop(self, now: float) -> None:
+        self.goal = self.at + max(-0.008, min(0.008, self.goal - self.at))
+
+    def step(self, now: float) -> None:
+        braking = abs(self.goal - self.at) < 0.009
+        held, self.paused = self.paused, self.paused and not braking
+        super().step(now)
+        self.paused = held
+
+
+def test_a_busy_computer_makes_a_driver_no_slower_than_its_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Time passes without steps; only as many count as fit into the time of a check."""
+    passing, calls = conformance._Clock.sleep, itertools.count()
+
+    def sleep(clock: conformance._Clock, seconds: float) -> None:
+        passing(clock, seconds + 0.3 * (next(calls) % 5 == 0))
+
+    assert checked(Brakes, within=0.2).faults == []
+    monkeypatch.setattr(conformance._Clock, "sleep", sleep)
+    assert checked(Brakes, within=0.2, seconds=60.0).faults == []
 
 
 class NeverStops(Axis):
