@@ -79,7 +79,8 @@ class SmallRelay:
                 limit = Limit("the stall")
                 while not self._stalled.is_set() and limit.left():
                     for found, _ in ready.select(0.02):
-                        cast(socket.socket, found.data).sendall(found.fileobj.recv(4096))  # type: ignore[union-attr]
+                        source, sink = (cast(socket.socket, s) for s in (found.fileobj, found.data))
+                        sink.sendall(source.recv(4096))
             self._over.wait(60.0)
             near.settimeout(20.0)
             with suppress(ConnectionResetError):

@@ -183,7 +183,7 @@ class NumpyEngine:
         for key in own:
             key[: len(new)] = _at(key, new)
         fresh = np.flatnonzero(number >= n)
-        number[fresh] = rank.take(_at(number, fresh) - n)
+        number[fresh] = _at(rank, _at(number, fresh) - n)
         rank[single] = number
         target = _at(rank, first)
         target[single] = number
