@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import gc
+import socket
 import time
+import warnings
 
 import pytest
 
@@ -36,6 +40,26 @@ async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
     await until(lambda: not callee._results.of("coord"))
     await coordinator.client.close()
     await until(lambda: node.server.connected == ())
+
+
+@pytest.mark.parametrize("turns", range(5))
+async def test_a_connection_accepted_while_the_server_closes_is_closed(turns: int) -> None:
+    """asyncio accepted it in one turn of the loop, and the server was closed before the next: the
+    connection was left to the garbage collector."""
+    node = Node()
+    await node.server.start("127.0.0.1", 0)
+    with warnings.catch_warnings(record=True) as seen, socket.socket() as client:
+        warnings.simplefilter("always")
+        client.connect(node.server.address)
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await node.server.close()
+        gc.collect()
+        client.setblocking(False)
+        with contextlib.suppress(ConnectionResetError):
+            async with asyncio.timeout(60.0):
+                assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
+    assert [str(one.message) for one in seen] == []
 
 
 async def test_calls_of_several_clients_of_a_process_have_different_ids(open_node: Node) -> None:

@@ -72,6 +72,18 @@ def allowed(most: int, share: int) -> int:
     return most if files == resource.RLIM_INFINITY else min(most, files // share)
 
 
+async def stop_accepting(server: asyncio.Server) -> None:
+    """Close a server's ports. Its connections stay open.
+
+    asyncio makes the transport of a connection one turn of the loop after it accepted it. If the
+    server is closed in between, that fails and leaves the connection open."""
+    loop = asyncio.get_running_loop()
+    for sock in server.sockets:
+        loop.remove_reader(sock)
+    await asyncio.sleep(0)
+    server.close()
+
+
 @dataclass(frozen=True)
 class LinkLimits:
     """Limits of a server and its connections."""
