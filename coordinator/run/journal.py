@@ -252,6 +252,7 @@ class JournalWriter:
             self.sync()
         finally:
             os.close(self._file)
+            date_back(self.path.parent.parent)
 
 
 def _remove_empty(folder: Path) -> None:
