@@ -6,8 +6,10 @@ import asyncio
 import contextlib
 import gc
 import socket
+import threading
 import time
 import warnings
+from typing import Any
 
 import pytest
 
@@ -60,6 +62,32 @@ async def test_a_connection_accepted_while_the_server_closes_is_closed(turns: in
             async with asyncio.timeout(60.0):
                 assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
     assert [str(one.message) for one in seen] == []
+
+
+async def test_names_that_nobody_resolves_delay_no_other_peer(
+    node: Node, key: bytes | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They blocked all threads of the loop's executor, so another peer was not reached, and the
+    process did not end, until the name server had answered."""
+    answered, known = threading.Event(), socket.getaddrinfo
+
+    def look_up(host: str, *rest: Any, **options: Any) -> list[Any]:
+        if host.endswith(".example"):
+            answered.wait(120.0)
+            raise socket.gaierror(socket.EAI_AGAIN, "no answer")
+        return known(host, *rest, **options)
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    _, port = node.server.address
+    absent = [Coordinator(f"absent{n}.example", port) for n in range(40)]
+    there = Coordinator("localhost", port, key=key)
+    try:
+        assert await there.client.connected(60.0)
+        assert not answered.is_set()
+    finally:
+        answered.set()
+        for one in (*absent, there):
+            await one.client.close()
 
 
 async def test_calls_of_several_clients_of_a_process_have_different_ids(open_node: Node) -> None:

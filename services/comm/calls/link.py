@@ -13,11 +13,12 @@ import math
 import resource
 import secrets
 import socket
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import Any
+from typing import Any, TypeVar
 
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -501,6 +502,31 @@ def futures_of(loop: asyncio.AbstractEventLoop) -> Callable[[], asyncio.Future[A
     a call."""
     usual = getattr(type(loop), "create_future", None) is asyncio.BaseEventLoop.create_future
     return functools.partial(asyncio.Future, loop=loop) if usual else loop.create_future
+
+
+T = TypeVar("T")
+
+
+def in_thread(work: Callable[[], T]) -> asyncio.Future[T]:
+    """Do what may block in a thread of its own. The threads of the loop's executor are few, and the
+    process waits for them at its end: a name server that does not answer would block all others."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def end(finish: Callable[[], None]) -> None:
+        if not done.done():
+            finish()
+
+    def run() -> None:
+        try:
+            finish = functools.partial(done.set_result, work())
+        except Exception as fault:
+            finish = functools.partial(done.set_exception, fault)
+        with contextlib.suppress(RuntimeError):  # the loop was closed, because this took so long
+            loop.call_soon_threadsafe(end, finish)
+
+    threading.Thread(target=run, daemon=True).start()
+    return done
 
 
 def _host(address: object) -> str:
