@@ -15,11 +15,13 @@ import secrets
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from petrobot.coordinator.run.supervisor import is_local
 from petrobot.services.comm.calls.caller import Caller, Notice, Patience, PeerLost
 from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.link import in_thread
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
@@ -222,7 +224,7 @@ def _place(directory: Directory, node: str) -> tuple[str, str, int]:
 async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopped:
     stopped = Stopped(node)
     line = None
-    kept = await asyncio.to_thread(_kept, directory, node) if verb == CLEAR else None
+    kept = await in_thread(partial(_kept, directory, node)) if verb == CLEAR else None
     try:
         line = EmergencyLine(directory, node, credentials(directory, COORDINATOR))
     except KeyFileError as fault:  # bus and latch need no key
@@ -248,7 +250,7 @@ async def _order(directory: Directory, node: str, verb: str, bus: bool) -> Stopp
         if verb == CLEAR and not stopped.answered and not (line and line.reached):
             said, stopped.cleared = await _unlatch(directory, node)
             stopped.latch = f"{stopped.why or 'it does not answer'}; {said}" if said else ""
-        elif stopped.done and kept and kept == await asyncio.to_thread(_kept, directory, node):
+        elif stopped.done and kept and kept == await in_thread(partial(_kept, directory, node)):
             # The node has not cleared this latch: it runs with another copy of services.toml.
             said, cleared = await _unlatch(directory, node)
             stopped.note = "" if cleared else said
@@ -292,15 +294,12 @@ async def _ask(line: EmergencyLine | None, stopped: Stopped, verb: str) -> None:
 async def _latch(directory: Directory, node: str) -> str:
     """Store on disk that the devices of a silent node are stopped; the node obeys when it continues
     or is started."""
-    if not await asyncio.to_thread(is_local, directory.nodes[node].host):
-        return (
-            f"not latched: {node} is on another host; run `petrobot estop` there before "
-            "it is started again"
-        )
+    if elsewhere := await _elsewhere(directory, node):
+        return f"not latched: {elsewhere}; run `petrobot estop` there before it is started again"
     try:
         # By name, too: services.toml may give a device to another node before this one is cleared.
         stopped = [ALL, *_devices_of(directory, node)]
-        path = await asyncio.to_thread(latch_of(directory.source, node).stop, stopped)
+        path = await in_thread(partial(latch_of(directory.source, node).stop, stopped))
     except LatchError as fault:
         return f"not latched: {fault}; do not start {node} again before the cell is safe"
     # The last folder is of this user: a node that another user runs does not look there.
@@ -312,14 +311,25 @@ async def _latch(directory: Directory, node: str) -> str:
     )
 
 
+async def _elsewhere(directory: Directory, node: str) -> str:
+    """Return why a node is not known to be on this host; empty if it is here."""
+    host = directory.nodes[node].host
+    try:
+        async with asyncio.timeout(STANDSTILL):
+            here = await in_thread(partial(is_local, host))
+    except TimeoutError:
+        return f"the lookup of {host} takes too long"
+    return "" if here else f"{node} is on another host"
+
+
 async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
     """Clear the stop of a node that does not answer on its disk; return what was done, and whether
     the stop is cleared."""
-    if node not in await asyncio.to_thread(still_stopped, directory):
+    if node not in await in_thread(partial(still_stopped, directory)):
         return "", False
     devices = _devices_of(directory, node)
     try:
-        await asyncio.to_thread(latch_of(directory.source, node).clear, devices, devices)
+        await in_thread(partial(latch_of(directory.source, node).clear, devices, devices))
     except LatchError as fault:
         return f"not cleared: {fault}", False
     return "its stop is cleared on disk, so its devices accept orders once it runs", True
@@ -338,8 +348,8 @@ def _devices_of(directory: Directory, node: str) -> list[str]:
 def still_stopped(directory: Directory) -> list[str]:
     """Return the nodes of this host whose devices are still stopped according to their disks."""
     nodes = nodes_with_devices(directory)
-    here = [node for node in nodes if is_local(directory.nodes[node].host)]
-    return [node for node in here if latch_of(directory.source, node).stopped()]
+    stopped = [node for node in nodes if latch_of(directory.source, node).stopped()]
+    return [node for node in stopped if is_local(directory.nodes[node].host)]
 
 
 async def _stop_buses(directory: Directory, node: str) -> str:
@@ -347,12 +357,12 @@ async def _stop_buses(directory: Directory, node: str) -> str:
     buses = buses_of(directory, node)
     if not buses:
         return ""
-    if not await asyncio.to_thread(is_local, directory.nodes[node].host):
+    if elsewhere := await _elsewhere(directory, node):
         return (
-            "its bus is on another host: run `petrobot estop --bus` there, or press the "
+            f"its bus is not stopped: {elsewhere}; run `petrobot estop --bus` there, or press the "
             "hardware's emergency stop"
         )
-    return "; ".join([await asyncio.to_thread(_stop_bus, can) for can in buses])
+    return "; ".join([await in_thread(partial(_stop_bus, can)) for can in buses])
 
 
 def _stop_bus(can: Mapping[str, Any]) -> str:

@@ -197,6 +197,10 @@ class ConnectionLimit:
         """Number of open connections."""
         return len(self._server.connections) + self._coming
 
+    def transports(self) -> list[asyncio.Transport | None]:
+        """Return the transports of the open connections; None where aiohttp has closed it."""
+        return [handler.transport for handler in self._server.connections]
+
     def _came(self) -> None:
         self._coming -= 1
 

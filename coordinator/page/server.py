@@ -18,8 +18,15 @@ from petrobot.coordinator.page import documents
 from petrobot.coordinator.page.access import HOST, AccessRules, ConnectionLimit, Handler, middleware
 from petrobot.coordinator.page.app_state import PAGE_STATE, PageState
 from petrobot.coordinator.page.requests import LARGEST_BODY, json_answer, read_object, refused
-from petrobot.coordinator.page.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
+from petrobot.coordinator.page.sessions import (
+    LARGEST_MESSAGE,
+    Session,
+    carry_out,
+    hang_up,
+    who_is,
+)
 from petrobot.coordinator.page.task_store import TaskStore
+from petrobot.services.comm.calls.link import stop_accepting
 
 PAGE_FILES = (Path(__file__).parent / "static").resolve()
 KEPT = "private, max-age=31536000, immutable"
@@ -56,20 +63,23 @@ class Page:
     async def close(self) -> None:
         """Close all connections and the port. The last commands are still answered, unless they
         take too long."""
-        self._listening.close()
+        await stop_accepting(self._listening)
         self._page_state.closing = True
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST_COMMANDS_S):
                 await self.idle()
-        await asyncio.gather(*(session.leave() for session in self._page_state.sessions))
         state = self._page_state
+        transports = self.limit.transports()
+        await asyncio.gather(*(session.leave() for session in state.sessions))
         await asyncio.gather(
             *(process.close() for process in (state.apart, state.checks, state.analyses))
         )
         await self._runner.cleanup()
-        for task in list(self._page_state.commands):
+        for transport in transports:
+            hang_up(transport)
+        for task in list(state.commands):
             task.cancel()
-        await asyncio.gather(*self._page_state.commands, return_exceptions=True)
+        await asyncio.gather(*state.commands, return_exceptions=True)
 
 
 async def start_page(
@@ -202,7 +212,9 @@ async def _live(request: web.Request) -> web.StreamResponse:
         await socket.prepare(request)
     except ConnectionError:  # The client left before it was answered, as when we were frozen.
         return web.Response()
-    session = Session(socket, page_state.port, page_state.encode_once, page_state.commands)
+    session = Session(
+        socket, request.transport, page_state.port, page_state.encode_once, page_state.commands
+    )
     page_state.sessions.add(session)
     try:
         await session.run()

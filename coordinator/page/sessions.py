@@ -53,17 +53,26 @@ def who_is(name: str, tab: str) -> str:
     return f"{clean} {hashlib.sha256(tab.encode()).hexdigest()[:4]}"
 
 
+def hang_up(transport: asyncio.Transport | None) -> None:
+    """Close a connection at once. `close` waits until its client has read everything: for ever, if
+    the client is frozen."""
+    if transport is not None:
+        transport.abort()
+
+
 class Session:
     """One connected client."""
 
     def __init__(
         self,
         socket: web.WebSocketResponse,
+        transport: asyncio.Transport | None,
         port: MissionPort,
         encoded: Encode,
         commands: set[asyncio.Task[None]],
     ) -> None:
         self._socket = socket
+        self._transport = transport
         self._port = port
         self._encoded = encoded
         # Held by the server: a command continues when its client leaves.
@@ -92,11 +101,9 @@ class Session:
                 stop()
                 await _end(sender)
         except BadMessageError as fault:
-            await self._socket.close(
-                code=WSCloseCode.POLICY_VIOLATION, message=str(fault).encode()[:120]
-            )
+            await self._close(WSCloseCode.POLICY_VIOLATION, str(fault).encode()[:120])
         except (ConnectionError, TimeoutError):
-            await self._close_hard()
+            await self._close(WSCloseCode.TRY_AGAIN_LATER)
 
     async def leave(self) -> None:
         """Close the connection properly, as when the server ends."""
@@ -187,7 +194,7 @@ class Session:
                         await self._news.wait()
                 await self._send_news()
         except (ConnectionError, TimeoutError):
-            await self._close_hard()
+            await self._close(WSCloseCode.TRY_AGAIN_LATER)
 
     async def _send_news(self) -> None:
         quiet = not self._news.is_set()
@@ -217,10 +224,13 @@ class Session:
         async with asyncio.timeout(SEND_S):
             await self._socket.send_str(text)
 
-    async def _close_hard(self) -> None:
-        with contextlib.suppress(Exception):
-            async with asyncio.timeout(1.0):
-                await self._socket.close(code=WSCloseCode.TRY_AGAIN_LATER)
+    async def _close(self, code: WSCloseCode, reason: bytes = b"") -> None:
+        try:
+            with contextlib.suppress(Exception):
+                async with asyncio.timeout(1.0):
+                    await self._socket.close(code=code, message=reason)
+        finally:  # also when this task is cancelled, because `_read_all` saw the end
+            hang_up(self._transport)
 
 
 async def carry_out(

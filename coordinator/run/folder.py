@@ -88,9 +88,9 @@ SKEW = 60 * 10**9
 
 
 def date_back(folder: Path) -> None:
-    """Call it when a run begins. Files of earlier runs from the future were written before the
-    clock was set back: date them before the new run, in their order. Otherwise one of them would
-    remain the newest run, and `retain` would remove the new ones."""
+    """Call it when a run begins and when it ends. Files from the future are of earlier runs, from
+    before the clock was set back: date them before this run, in their order. Otherwise one of them
+    would remain the newest run, and `retain` would remove the new ones."""
     dated: list[tuple[int, Path]] = []
     for name in (JOURNAL, RESULT):
         for path in folder.glob(f"*/{name}"):

@@ -252,6 +252,7 @@ class JournalWriter:
             self.sync()
         finally:
             os.close(self._file)
+            date_back(self.path.parent.parent)
 
 
 def _remove_empty(folder: Path) -> None:
@@ -262,7 +263,11 @@ def _remove_empty(folder: Path) -> None:
 def read_journal(path: Path) -> Journal:
     """Read a journal; a torn tail is dropped and counted. Raises JournalError for any other damage,
     and OSError."""
-    raw = path.read_bytes()
+    try:
+        raw = path.read_bytes()
+    except PermissionError as fault:
+        text = f"{path.parent.name} was started by another user, who alone can read its journal"
+        raise JournalError(text) from fault
     if not raw.startswith(MAGIC):
         raise JournalError(f"{path}: {_foreign(raw)}")
     records: list[Record] = []

@@ -9,17 +9,16 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from shlex import quote
-from threading import Thread
 from typing import Final, TypeVar
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
 from petrobot.services.comm.calls.caller import Notice, PeerLost
 from petrobot.services.comm.calls.client import KEY_CODES, Client
+from petrobot.services.comm.calls.link import in_thread
 from petrobot.services.comm.calls.peers import LEASED, OVERTAKEN
 from petrobot.services.comm.location_file import MOCK, Directory, sources
 from petrobot.services.comm.protocol.messages import (
@@ -113,30 +112,18 @@ def on_disk(work: Callable[[], T]) -> asyncio.Future[T]:
     """Do what writes to the disk in a thread: a sync may take seconds, in which the nodes and the
     operators must be answered. The future raises what `work` raises, and JournalError after
     `DISK_PATIENCE`."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[T] = loop.create_future()
-
-    def end(finish: Callable[[], None]) -> None:
-        patience.cancel()
-        if not done.done():
-            finish()
-
-    def in_thread() -> None:
-        try:
-            finish = partial(done.set_result, work())
-        except Exception as fault:
-            finish = partial(done.set_exception, fault)
-        with suppress(RuntimeError):  # the loop was closed, because this took so long
-            loop.call_soon_threadsafe(end, finish)
-
+    done = in_thread(work)
     text = (
         f"the disk of the journal has not answered for {DISK_PATIENCE:g} s; nothing was sent on "
         "the strength of its last records; `petrobot resume` continues when it answers again"
     )
-    silent = partial(done.set_exception, JournalError(text))
-    patience = loop.call_later(DISK_PATIENCE, end, silent)
-    # A daemon: a disk that never answers must not keep the process from its end.
-    Thread(target=in_thread, name="journal", daemon=True).start()
+
+    def give_up() -> None:
+        if not done.done():
+            done.set_exception(JournalError(text))
+
+    patience = asyncio.get_running_loop().call_later(DISK_PATIENCE, give_up)
+    done.add_done_callback(lambda _: patience.cancel())
     return done
 
 

@@ -175,16 +175,14 @@ class ProcessPorts(DevicePorts):
                 cleared=self._cleared,
             )
 
-    def stream_ports(self) -> dict[str, int]:
-        """Return the TCP port of each stream that leads here. All are open from the beginning: a
-        driver may ask for one as late as in its first `step`."""
+    def stream_addresses(self) -> dict[str, tuple[str, int]]:
+        """Return IP address and TCP port of each stream that leads here. All are open from the
+        beginning: a driver may ask for one as late as in its first `step`."""
         for name in self._tickets:
             if self._directory.streams[name].to == self._device.name:
                 self.stream(name)
         return (
-            {}
-            if self._receiver is None
-            else dict.fromkeys(self._incoming, self._receiver.address[1])
+            {} if self._receiver is None else dict.fromkeys(self._incoming, self._receiver.address)
         )
 
     def poll(self) -> None:

@@ -245,8 +245,8 @@ class NodeShell:
         place = self._workers[self._directory.streams[stream].to]
         if stream not in place.streams:
             return None
-        host = self._directory.nodes[self._name].host
-        return {"host": host, "port": place.streams[stream], "ticket": self._tickets[stream]}
+        host, port = place.streams[stream]
+        return {"host": host, "port": port, "ticket": self._tickets[stream]}
 
     def _find_stream(self, device: str, stream: str) -> None:
         """Ask the receiver's node for the address of a stream that an action sends."""

@@ -188,8 +188,8 @@ class WorkerHost:
         """Process of the device's driver; None without a device."""
         self._worker: Child | None = None
         """Process of the actions: the owner itself, unless the driver is cyclic."""
-        self.streams: Mapping[str, int] = {}
-        """TCP port of each stream that is received here."""
+        self.streams: Mapping[str, tuple[str, int]] = {}
+        """IP address and TCP port of each stream that is received here."""
         self.failed = ""
         """Why a process could not be started, empty if it could."""
         self._died = ""
@@ -384,7 +384,7 @@ class WorkerHost:
     def _take_ready(self, child: Child, data: Mapping[str, Any]) -> None:
         driver = child is self._owner
         if driver and self._stage is HostStage.DRIVER_STARTS:
-            self.streams = dict(data["streams"])
+            self.streams = {name: (host, port) for name, (host, port) in data["streams"].items()}
             self._period = data["period"] or 0.0
             if self._emergency:
                 child.post(Command("", EMERGENCY_STOP))

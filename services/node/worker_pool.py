@@ -82,7 +82,7 @@ class WorkerPool:
         self._queued = False
         """Whether a call was put behind another one since the last call of `due`."""
         self._reports: list[Report] = []
-        self.streams: Mapping[str, int] = {}
+        self.streams: Mapping[str, tuple[str, int]] = {}
         """Actions without a device receive no stream."""
 
     # --- workers ------------------------------------------------------------------------------

@@ -541,7 +541,7 @@ def serve(
                         READY,
                         {
                             "period": driver.period,
-                            "streams": ports.stream_ports(),
+                            "streams": ports.stream_addresses(),
                             "fifo": take_priority(),
                         },
                     ]
@@ -551,7 +551,7 @@ def serve(
             worker = Worker(
                 setup, directory, node, permits, driver=driver, ports=ports, guard=guard
             )
-            streams = ports.stream_ports()
+            streams = ports.stream_addresses()
         else:
             worker, streams = Worker(setup, directory, node, permits, link=link), {}
         worker.await_device()

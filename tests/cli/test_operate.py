@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.cli import COMMANDS, main
+from petrobot.coordinator.cli import COMMANDS, CommandError, main
+from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.cli.resume import later_run, located
 from petrobot.coordinator.engine import Mode
 from petrobot.coordinator.operator import commands
@@ -661,12 +662,12 @@ async def test_the_result_says_that_the_host_was_too_busy(petrobot: Terminal) ->
 def test_the_run_of_another_user_is_not_said_to_be_interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its address can only be read by its owner."""
+    """Its address and its journal can only be read by its owner."""
     tmp_path.chmod(0o755)
     monkeypatch.chdir(tmp_path)
     runs, me = Path("runs"), os.geteuid()
     with published(runs / "theirs", RunAddress("theirs", "http://x", "t", os.getpid())) as path:
-        (runs / "theirs" / JOURNAL).touch()
+        (runs / "theirs" / JOURNAL).touch(0)
         path.chmod(0)
         if me == 0:
             os.seteuid(65534)  # root may read it
@@ -675,5 +676,7 @@ def test_the_run_of_another_user_is_not_said_to_be_interrupted(
             for name in (None, "theirs"):
                 with pytest.raises(NoRunError, match="theirs was started by another user"):
                     find_address(name, runs)
+            with pytest.raises(CommandError, match="theirs was started by another user, who"):
+                recorded("last")
         finally:
             os.seteuid(me)

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import gc
+import socket
+import threading
 import time
+import warnings
+from typing import Any
 
 import pytest
 
@@ -36,6 +42,52 @@ async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
     await until(lambda: not callee._results.of("coord"))
     await coordinator.client.close()
     await until(lambda: node.server.connected == ())
+
+
+@pytest.mark.parametrize("turns", range(5))
+async def test_a_connection_accepted_while_the_server_closes_is_closed(turns: int) -> None:
+    """asyncio accepted it in one turn of the loop, and the server was closed before the next: the
+    connection was left to the garbage collector."""
+    node = Node()
+    await node.server.start("127.0.0.1", 0)
+    with warnings.catch_warnings(record=True) as seen, socket.socket() as client:
+        warnings.simplefilter("always")
+        client.connect(node.server.address)
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await node.server.close()
+        gc.collect()
+        client.setblocking(False)
+        with contextlib.suppress(ConnectionResetError):
+            async with asyncio.timeout(60.0):
+                assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
+    assert [str(one.message) for one in seen] == []
+
+
+async def test_names_that_nobody_resolves_delay_no_other_peer(
+    node: Node, key: bytes | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They blocked all threads of the loop's executor, so another peer was not reached, and the
+    process did not end, until the name server had answered."""
+    answered, known = threading.Event(), socket.getaddrinfo
+
+    def look_up(host: str, *rest: Any, **options: Any) -> list[Any]:
+        if host.endswith(".example"):
+            answered.wait(120.0)
+            raise socket.gaierror(socket.EAI_AGAIN, "no answer")
+        return known(host, *rest, **options)
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    _, port = node.server.address
+    absent = [Coordinator(f"absent{n}.example", port) for n in range(40)]
+    there = Coordinator("localhost", port, key=key)
+    try:
+        assert await there.client.connected(60.0)
+        assert not answered.is_set()
+    finally:
+        answered.set()
+        for one in (*absent, there):
+            await one.client.close()
 
 
 async def test_calls_of_several_clients_of_a_process_have_different_ids(open_node: Node) -> None:

@@ -130,7 +130,7 @@ class FakeChild:
         self.code, self.closed, self.dead = code, True, True
         self._ended(self)
 
-    def ready(self, period: float | None = None, **streams: int) -> None:
+    def ready(self, period: float | None = None, **streams: tuple[str, int]) -> None:
         self.say([READY, {"period": period, "streams": streams, "fifo": False}])
 
     def orders(self) -> list[Order]:
@@ -207,7 +207,7 @@ class Bench(HostBench):
 
     def cyclic(self) -> tuple[FakeChild, FakeChild]:
         """Start driver and actions of a cyclic device."""
-        self.children[-1].ready(0.004, points=4711)
+        self.children[-1].ready(0.004, points=("10.0.0.1", 4711))
         self.children[-1].ready()
         return self.children[-2], self.children[-1]
 
@@ -232,7 +232,7 @@ def test_a_device_without_cycle_has_one_process() -> None:
 def test_a_cyclic_device_has_two_with_a_link_between_them() -> None:
     bench = Bench(child=KeepingChild)
     driver, actions = bench.cyclic()
-    assert bench.place.streams == {"points": 4711} and set(bench.place.pids()) == {
+    assert bench.place.streams == {"points": ("10.0.0.1", 4711)} and set(bench.place.pids()) == {
         "actions",
         "driver",
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -16,7 +17,7 @@ from petrobot.coordinator.operator.changes import apply
 from petrobot.coordinator.page import app_state, sessions
 from petrobot.coordinator.page.server import Page
 from tests.page.stage import Stage
-from tests.waiting import beat
+from tests.waiting import beat, until
 
 
 class Client:
@@ -118,6 +119,51 @@ async def test_a_slow_client_gets_merged_changes_and_delays_no_other_client(
         await slow.until(lambda s: s["sequence"] == last)
         assert slow.deltas + slow.snapshots < 200
         assert slow.state["variables"] == stage.feed.state["variables"]
+
+
+def frozen(page: Page, path: str, *lines: str) -> socket.socket:
+    """Send a request from a client that then reads nothing."""
+    host = page.base.rpartition("/")[2]
+    client = socket.socket()
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    client.connect(("127.0.0.1", int(host.rpartition(":")[2])))
+    token = f"Authorization: Bearer {page.token}"
+    head = (f"GET {path} HTTP/1.1", f"Host: {host}", token, *lines, "", "")
+    client.sendall("\r\n".join(head).encode())
+    return client
+
+
+@pytest.fixture
+def large(stage: Stage) -> None:
+    """A snapshot that is larger than what a connection holds on its way."""
+    for number in range(40):
+        stage.feed.emit("variable", name=f"v{number}", value="x" * 250_000)
+
+
+@pytest.mark.usefixtures("large")
+async def test_a_frozen_client_is_disconnected(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its session ended never, so it kept the controls and one of the connections."""
+    monkeypatch.setattr(sessions, "SEND_S", 0.2)
+    upgrade = ("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13")
+    key = "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg=="
+    hello = b'{"type":"hello","protocol":1,"name":"ana","tab":"1"}'
+    with frozen(page, "/api/live", *upgrade, key) as client:
+        client.sendall(bytes([0x81, 0x80 | len(hello)]) + bytes(4) + hello)
+        await until(lambda: page.limit.open_connections == 1, "the client's connection")
+        await until(lambda: page.limit.open_connections == 0, "the end of the connection")
+    assert not page._page_state.sessions
+
+
+@pytest.mark.usefixtures("large")
+async def test_an_answer_that_is_not_read_does_not_outlive_the_page(page: Page) -> None:
+    """Its connection was left open: `close` waits until the client has read everything."""
+    with frozen(page, "/api/snapshot"):
+        await until(page.limit.transports, "the client's connection")
+        (transport,) = page.limit.transports()
+        assert transport is not None
+        await until(transport.get_write_buffer_size, "a part that is not read")
+        await page.close()
+        assert transport.get_write_buffer_size() == 0
 
 
 async def test_too_many_firings_are_replaced_by_a_snapshot(page: Page, stage: Stage) -> None:

@@ -73,6 +73,18 @@ def test_runs_from_before_the_clock_was_set_back_are_older_than_a_new_one(tmp_pa
     assert retain(tmp_path, 2) == ["a", "b"]
 
 
+def test_a_run_in_which_the_clock_is_set_back_is_the_newest_at_its_end(tmp_path: Path) -> None:
+    """It was removed at its end by `--keep`, as the oldest."""
+    new = JournalWriter(tmp_path / "new" / JOURNAL, {})
+    hour = int(1e9 - time.time() - 3600)
+    for name, age in (("a", hour + 1), ("b", hour)):
+        a_run(tmp_path, name, age)
+    new.close()
+    (tmp_path / "new" / RESULT).write_text("{}")
+    assert journal_of("last", tmp_path).parent.name == "new"
+    assert retain(tmp_path, 1) == ["a", "b"]
+
+
 @pytest.mark.parametrize("name", ["new", "last"])
 def test_a_run_is_found_by_id_folder_journal_or_as_the_last(tmp_path: Path, name: str) -> None:
     a_run(tmp_path, "old", 50)

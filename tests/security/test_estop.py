@@ -8,6 +8,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -23,7 +24,7 @@ from petrobot.coordinator.cli import estop, main
 from petrobot.coordinator.cli.estop import HARDWARE
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
-from petrobot.coordinator.operator.emergency_stop import still_stopped
+from petrobot.coordinator.operator.emergency_stop import order_all, still_stopped
 from petrobot.coordinator.operator.run_address import RunAddress, find_address, published
 from petrobot.coordinator.run.folder import NoRunError, header
 from petrobot.coordinator.run.journal import JournalWriter
@@ -31,6 +32,7 @@ from petrobot.coordinator.run.realtime import RealtimeMission
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory, load
+from petrobot.services.comm.protocol.security import new_key, write_key
 from petrobot.services.device import Driver
 from petrobot.services.host.emergency_latch import latch_of
 from petrobot.services.node.inline_host import InlineHost
@@ -278,6 +280,43 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
     assert code == 3 and "NO ANSWER" in out and "no CAN hub" in out
     with pytest.raises(NoRunError):
         find_address(folder=tmp_path)
+
+
+async def test_names_that_nobody_resolves_keep_no_stop_from_other_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lookups blocked all threads of the loop, also those for the latch of a node of this host,
+    and the answer came after the last of them."""
+    answered, known = threading.Event(), socket.getaddrinfo
+
+    def look_up(host: str, *rest: Any, **options: Any) -> list[Any]:
+        if host.endswith(".example"):
+            answered.wait(LIMIT)
+            raise socket.gaierror(socket.EAI_AGAIN, "no answer")
+        return known(host, *rest, **options)
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    absent = [f"a{n}" for n in range(40)]
+    hosts = {**{name: f"{name}.example" for name in absent}, "here": "localhost"}
+    ports = dict(zip(hosts, free_ports(len(hosts)), strict=True))
+    lines = ["schema = 1", '[keys]\nfile = "cell.key"']
+    for name, host in hosts.items():
+        lines.append(f'[nodes.{name}]\nhost = "{host}"\nport = {ports[name]}')
+        lines.append(f'[devices.arm_{name}]\nnode = "{name}"\ndriver = "m:Arm"')
+    source = tmp_path / "services.toml"
+    source.write_text("\n".join(lines))
+    write_key(tmp_path / "cell.key", new_key())
+    try:
+        answers = {one.node: one for one in await order_all(load(source))}
+        assert not answered.is_set()
+    finally:
+        answered.set()
+    assert answers["here"].latch.startswith("latched")
+    assert {answers[name].latch for name in absent} == {
+        f"not latched: the lookup of {name}.example takes too long; run `petrobot estop` there "
+        "before it is started again"
+        for name in absent
+    }
 
 
 @pytest.mark.parametrize("keys", ['file = "cell.key"', 'certificates = "keys"'])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import itertools
 import logging
 import math
@@ -18,6 +19,7 @@ import random
 import socket
 import ssl
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from petrobot.services.comm.calls.caller import Caller, Notice
@@ -29,6 +31,7 @@ from petrobot.services.comm.calls.link import (
     LinkTiming,
     clock_of,
     futures_of,
+    in_thread,
 )
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -123,6 +126,12 @@ class _ClientLink(AsyncLink):
         self._client.gone(now, self)
 
 
+def _addresses(host: str) -> list[str]:
+    """Return the IP addresses of a name. Raises OSError."""
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    return list(dict.fromkeys(str(address[0]) for *_, address in found))
+
+
 class Client:
     """Keeps a caller connected to its peer.
 
@@ -168,6 +177,7 @@ class Client:
         self._link: _ClientLink | None = None
         self._future = futures_of(self._loop)
         self._task: asyncio.Task[None] | None = None
+        self._lookup: asyncio.Future[list[str]] | None = None
         self._alarm = Alarm(self._advance)
         self._excused = False
         self._behind = -math.inf
@@ -208,6 +218,8 @@ class Client:
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
+        if self._lookup is not None:
+            self._lookup.cancel()
         link = self._link
         if link is not None:
             link.end(text, Bye(text) if link.connection.state is ConnectionState.OPEN else None)
@@ -315,16 +327,9 @@ class Client:
             pause = min(2.0 * pause, longest)
 
     async def _connect(self) -> _ClientLink | None:
-        name = self.caller.peer if self.tls is not None else None
         try:
             async with asyncio.timeout(self.timing.silence):
-                _, link = await self._loop.create_connection(
-                    lambda: _ClientLink(self),
-                    self.host,
-                    self.port,
-                    ssl=self.tls,
-                    server_hostname=name,
-                )
+                link = await self._reach()
         except (OSError, TimeoutError) as fault:
             self.trouble, self.answered = self._said(fault), isinstance(fault, ssl.SSLError)
             self.caller.unreached(
@@ -334,6 +339,34 @@ class Client:
             return None
         self.answered = True
         self._link = link
+        return link
+
+    async def _look_up(self) -> list[str]:
+        """Return the IP addresses of the peer's host. A lookup that takes longer than an attempt
+        serves the next one."""
+        with contextlib.suppress(ValueError):
+            ipaddress.ip_address(self.host)
+            return [self.host]
+        if self._lookup is None:
+            self._lookup = in_thread(partial(_addresses, self.host))
+        try:
+            return await asyncio.shield(self._lookup)
+        finally:
+            if self._lookup.done():
+                self._lookup = None
+
+    async def _reach(self) -> _ClientLink:
+        *others, last = await self._look_up()
+        for address in others:
+            with contextlib.suppress(OSError):
+                return await self._reach_at(address)
+        return await self._reach_at(last)
+
+    async def _reach_at(self, address: str) -> _ClientLink:
+        name = self.caller.peer if self.tls is not None else None
+        _, link = await self._loop.create_connection(
+            lambda: _ClientLink(self), address, self.port, ssl=self.tls, server_hostname=name
+        )
         return link
 
     def took_outcomes(self, now: float, outcomes: list[Outcome]) -> None:

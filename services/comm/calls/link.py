@@ -13,11 +13,12 @@ import math
 import resource
 import secrets
 import socket
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import Any
+from typing import Any, TypeVar
 
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -70,6 +71,18 @@ def allowed(most: int, share: int) -> int:
     reached."""
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return most if files == resource.RLIM_INFINITY else min(most, files // share)
+
+
+async def stop_accepting(server: asyncio.Server) -> None:
+    """Close a server's ports. Its connections stay open.
+
+    asyncio makes the transport of a connection one turn of the loop after it accepted it. If the
+    server is closed in between, that fails and leaves the connection open."""
+    loop = asyncio.get_running_loop()
+    for sock in server.sockets:
+        loop.remove_reader(sock)
+    await asyncio.sleep(0)
+    server.close()
 
 
 @dataclass(frozen=True)
@@ -489,6 +502,31 @@ def futures_of(loop: asyncio.AbstractEventLoop) -> Callable[[], asyncio.Future[A
     a call."""
     usual = getattr(type(loop), "create_future", None) is asyncio.BaseEventLoop.create_future
     return functools.partial(asyncio.Future, loop=loop) if usual else loop.create_future
+
+
+T = TypeVar("T")
+
+
+def in_thread(work: Callable[[], T]) -> asyncio.Future[T]:
+    """Do what may block in a thread of its own. The threads of the loop's executor are few, and the
+    process waits for them at its end: a name server that does not answer would block all others."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[T] = loop.create_future()
+
+    def end(finish: Callable[[], None]) -> None:
+        if not done.done():
+            finish()
+
+    def run() -> None:
+        try:
+            finish = functools.partial(done.set_result, work())
+        except Exception as fault:
+            finish = functools.partial(done.set_exception, fault)
+        with contextlib.suppress(RuntimeError):  # the loop was closed, because this took so long
+            loop.call_soon_threadsafe(end, finish)
+
+    threading.Thread(target=run, daemon=True).start()
+    return done
 
 
 def _host(address: object) -> str:

@@ -27,6 +27,7 @@ from petrobot.services.comm.calls.link import (
     AsyncLink,
     LinkLimits,
     LinkTiming,
+    stop_accepting,
 )
 from petrobot.services.comm.protocol.messages import (
     Answer,
@@ -323,7 +324,9 @@ class Server:
     async def close(self, text: str = "the node stops") -> None:
         """Say BYE to all callers and stop listening."""
         self._closed = True
-        if self._server is not None:
+        if isinstance(self._server, asyncio.Server):
+            await stop_accepting(self._server)
+        elif self._server is not None:
             self._server.close()
         for link in list(self._all):
             if link.connection.state is ConnectionState.OPEN:

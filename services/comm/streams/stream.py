@@ -209,7 +209,7 @@ class StreamSender:
 
     It connects when there is first something to send. When that fails or the receiver is gone, it
     tries again at most every 0.1 s. `name` is the sender, `receiver` the device that must receive;
-    another device is sent nothing.
+    another device is sent nothing. `host` is an IP address: looking up a name would wait.
     """
 
     def __init__(
