@@ -98,6 +98,8 @@ def task_line(figures: Mapping[str, Any]) -> str:
     rho = "" if figures["rho"] is None else f", rho {figures['rho']:.3g}"
     if figures["C"] is None:
         rho = "; these trials do not tell C and J of this cost"
+    elif figures["J"] is None:
+        rho = "; J needs a --rho, because a primitive task has no measured cost now"
     n, where = figures["trials"], figures["context"]
     trials = f"{n} trial{'s' * (n != 1)} of the task{f' ({where})' if where else ''}"
     return f"{trials}: {', '.join(parts)}{rho}"
