@@ -66,6 +66,8 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
         for task, figures in whole.items():
             if figures is not None:
                 print(f"{task}: {task_line(figures)}")
+        if not shown and not whole:
+            print(f"{options.file}: no run has been learned from")
     return 0
 
 
