@@ -320,7 +320,8 @@ def _refuse_unknown(kept: FileContents, options: argparse.Namespace) -> None:
         if task not in _tasks(kept):
             raise CommandError(
                 2,
-                f"{options.file} has no primitive task {task!r}; it has: {', '.join(_tasks(kept))}",
+                f"{options.file} has no primitive task {task!r}; it has: "
+                f"{', '.join(_tasks(kept)) or 'none'}",
             )
 
 

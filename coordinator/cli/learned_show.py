@@ -66,6 +66,8 @@ def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) 
         for task, figures in whole.items():
             if figures is not None:
                 print(f"{task}: {task_line(figures)}")
+        if not shown and not whole:
+            print(f"{options.file}: no run has been learned from")
     return 0
 
 
@@ -98,6 +100,8 @@ def task_line(figures: Mapping[str, Any]) -> str:
     rho = "" if figures["rho"] is None else f", rho {figures['rho']:.3g}"
     if figures["C"] is None:
         rho = "; these trials do not tell C and J of this cost"
+    elif figures["J"] is None:
+        rho = "; J needs a --rho, because a primitive task has no measured cost now"
     n, where = figures["trials"], figures["context"]
     trials = f"{n} trial{'s' * (n != 1)} of the task{f' ({where})' if where else ''}"
     return f"{trials}: {', '.join(parts)}{rho}"

@@ -387,7 +387,8 @@ def task_figures(
     cost of a trial there, and rho is the given one, else 1 / C with the alternatives that cost
     most. (Composed, C of an action is that of the hardest context that meets its target, if it has
     one; trials cannot be taken apart so.) C and J are None if the primitive tasks measure different
-    costs, or if not all trials reported theirs. `measures` and `compared`: by primitive task, its
+    costs, or if not all trials reported theirs; J also if no cost is known of a primitive task
+    (after `learned reset`, for example). `measures` and `compared`: by primitive task, its
     cost measure and the comparison of its actions.
     """
     begun = {context: sums for context, sums in trials.items() if sums.n}
@@ -401,12 +402,14 @@ def task_figures(
     if len({measures[name] for name in hardest.runs}) != 1 or cost.n < n or n < 2:
         return found
     largest = sum(
-        k / n * max((f.cost for f in compared[name].figures if isfinite(f.cost)), default=0.0)
+        k / n * max((f.cost for f in compared[name].figures if isfinite(f.cost)), default=nan)
         for name, k in hardest.runs.items()
     )
-    weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
     # the cost in the context that happens to be the hardest of m: at level 1 - 0.05 / m
     c = (cost.mean, *mean_interval(cost, 1.0 - 0.05 / len(begun)))
+    if rho is None and isnan(largest):
+        return replace(found, cost=c)
+    weight = rho if rho is not None else 1.0 / largest if largest > 0 else 0.0
     # correlation of success and cost within a trial: they come from the same trials
     spread = sqrt(r * (1.0 - r) * cost.m2 / n)
     joint = r * (hardest.good_cost.mean - cost.mean) / spread if spread > 0 else 0.0

@@ -182,7 +182,7 @@ def measured_from(
         if place.kind is not Kind.ACTION:
             continue
         takers, own = _preempting(task, place.name), (apart or {}).get(place.name, {})
-        for action, by_context in estimates.of(place.task, context).items():
+        for action, by_context in _alternatives(task, place.task, estimates, context).items():
             tally = reduce(Tally.merged, by_context.values(), Tally())
             started = tally.runs + tally.censored + sum(tally.not_executed.values())
             tally = own.get(action, tally)
@@ -219,6 +219,15 @@ def measured_from(
         mixed=frozenset(mixed),
         waits_of=waits_of,
     )
+
+
+def _alternatives(
+    task: Task, primitive: str, estimates: Estimates, context: str | None
+) -> dict[str, Mapping[str, Tally]]:
+    """Return the tallies of the actions that a primitive task has now; the file may know others,
+    which were removed or renamed."""
+    now, known = task.primitive_tasks[primitive].alternatives, estimates.of(primitive, context)
+    return {action: by_context for action, by_context in known.items() if action in now}
 
 
 def limits_of(task: Task, primitive: str) -> set[float]:
@@ -545,7 +554,7 @@ def _scenarios(task: Task, estimates: Estimates) -> list[str]:
     runs = [
         {
             where
-            for by_context in estimates.of(name).values()
+            for by_context in _alternatives(task, name, estimates, None).values()
             for where, tally in by_context.items()
             if tally.judged
         }
@@ -587,7 +596,7 @@ def _figures(
     for name in task.primitive_tasks:
         places = [p.name for p in task.flat.places.values() if p.task == name]
         runs = sum(n for (place, _), n in found.visits.items() if place in places)
-        judged = compare(estimates.of(name, context), asked[name])
+        judged = compare(_alternatives(task, name, estimates, context), asked[name])
         shares = found.measured.choice.get(name, {})
         part = _part(name, judged, shares, asked[name], runs)
         if part is not None:

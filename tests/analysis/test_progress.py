@@ -1061,7 +1061,48 @@ def test_a_branch_that_can_never_fire_is_reported_with_its_reason() -> None:
     )
     verdict = judged(task).quasi_live
     assert verdict.holds is False
-    assert verdict.reason == "never can never fire: in every state at rest it needs 2 of bin"
+    assert verdict.reason == (
+        "never can never fire: it needs 2 of bin, which never holds more than 1"
+    )
+
+
+def test_more_tokens_than_a_place_ever_holds_are_the_cause() -> None:
+    """Who took the one token of `arm` first does not matter: there are never two."""
+    task = make_task(
+        "todo=3 arm~=1 belt/1 cut! done",
+        {
+            "take": {"in": "todo arm", "out": "cut"},
+            "cut_ok": {"in": "cut:normal", "out": "belt arm"},
+            "cut_bad": {"in": "cut:error", "out": "todo arm"},
+            "pick": {"in": "belt arm*2", "out": "done arm*2"},
+        },
+        final="todo == 0 and done == 3",
+    )
+    found = judged(task)
+    assert found.quasi_live.reason == (
+        "pick can never fire: it needs 2 of arm, which never holds more than 1"
+    )
+    assert "arm: it never holds more than 1" in found.deadlock_free.details
+    assert not any("still held" in line for line in found.deadlock_free.details)
+
+
+def test_what_holds_the_missing_token_says_why_it_stays() -> None:
+    """`done` keeps the key as long as the last run of `act` did not end in failure."""
+    task = make_task(
+        "jobs=2 key~=1 act! clean! done",
+        {
+            "begin": {"in": "jobs", "out": "act"},
+            "good": {"in": "act:normal key", "out": "clean"},
+            "bad": {"in": "act:error key", "out": "key"},
+            "cleaned": {"in": "clean:normal", "out": "done"},
+            "dirty": {"in": "clean:error", "out": "key"},
+            "give": {"in": "done", "out": "key", "when": "act.status == 'failure'"},
+        },
+        final="jobs == 0 and key == 1",
+    )
+    details = judged(task).deadlock_free.details
+    at = details.index("key: taken by `good`, still held with done")
+    assert details[at + 1] == "done: give has a false condition (act.status == 'failure')"
 
 
 def test_branches_that_wait_for_each_other_are_told_by_the_token_that_is_missing() -> None:
@@ -1733,7 +1774,7 @@ def test_a_place_that_never_holds_enough_is_told_with_the_number() -> None:
     net = {"next": {"in": "parts grip*2", "out": "done"}, "back": {"in": "done", "out": "grip"}}
     task = make_task("parts=1 grip~=1 done", net, final="parts == 0 and done == 0")
     assert judged(task).quasi_live.reason.startswith(
-        "next can never fire: it needs 2 of grip, which only `back` can fill"
+        "next can never fire: it needs 2 of grip, which never holds more than 1"
     )
 
 

@@ -210,6 +210,17 @@ def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObj
     pairs = sorted((a % n, b % n) for a, b in pairs)
     source, target = (np.array([p[k] for p in pairs], dtype=np.int32) for k in (0, 1))
     graph = Graph(n, source, target)
+    goal = data.draw(st.integers(0, n - 1))
+    kept = np.array(data.draw(st.lists(st.booleans(), min_size=len(pairs), max_size=len(pairs))))
+    found = []
+    for wide in (0, graphs.WIDE):  # with numpy, and in plain Python
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(graphs, "WIDE", wide)
+            back = graph.backward([goal], kept.astype(bool)).tolist()
+            found.append(
+                (back, *(graph.path(0, np.arange(n) == goal, e) for e in (None, kept == 1)))
+            )
+    assert found[0] == found[1]
     reach = np.eye(n, dtype=bool)
     for a, b in pairs:
         reach[a, b] = True
@@ -218,7 +229,6 @@ def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObj
     labels = graph.components
     assert np.array_equal(labels[:, None] == labels[None, :], reach & reach.T)
     assert np.array_equal(graph.backward([0]), reach[:, 0])
-    goal = data.draw(st.integers(0, n - 1))
     path = graph.path(0, np.arange(n) == goal)
     assert (path is not None) == reach[0, goal]
     if path:

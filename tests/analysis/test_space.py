@@ -147,6 +147,13 @@ def test_auto_changes_to_numpy_and_agrees_with_integers() -> None:
     assert list(auto.markings(1000))[3][1].tolist() == list(plain.markings(1000))[3][1].tolist()
 
 
+def test_a_narrow_graph_stays_with_integers() -> None:
+    """numpy would need a pass of its own for each of 15,000 layers of one marking."""
+    net = Net.build({"parts": 15_000, "done": 0}, {"next": ({"parts": 1}, {"done": 1})})
+    space = explore(net)
+    assert space.complete and len(space) == 15_001 and space.engine == "integers"
+
+
 @pytest.mark.parametrize(
     ("n", "states", "edges"), [(1, 160, 616), (2, 4600, 28120), (3, 58400, 446400)]
 )

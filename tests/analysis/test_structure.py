@@ -111,6 +111,28 @@ def test_bounds_are_never_below_reachable_tokens(net: Net) -> None:
         assert linear is not None or bound is None or net.capacity[p] is not None
 
 
+@pytest.mark.parametrize("enumerated", [structure.SMALL_EFFORT, 0])
+def test_a_sum_that_never_grows_bounds_what_no_invariant_bounds(
+    enumerated: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`parts` is only taken from, and of what is dropped nothing is counted."""
+    monkeypatch.setattr(structure, "SMALL_EFFORT", enumerated)
+    net = Net.build(
+        {"parts": 500, "arm": 1, "grasp": 0, "trays": 0},
+        {
+            "next": ({"parts": 2, "arm": 1}, {"grasp": 1}),
+            "grasped": ({"grasp": 1}, {"arm": 1, "trays": 3}),
+            "dropped": ({"grasp": 1}, {"arm": 1}),
+        },
+    )
+    assert None not in (bounds := place_bounds(net))
+    exact = [500, 1, 1, 750]
+    assert all(bound is not None and bound >= n for bound, n in zip(bounds, exact, strict=True))
+    assert not enumerated or bounds == exact
+    endless = Net.build({"a": 1, "b": 0}, {"t": ({"a": 1}, {"a": 1, "b": 1})})
+    assert place_bounds(endless) == [1, None]
+
+
 @settings(max_examples=40, deadline=None)
 @given(nets(inhibitors=False, capacities=False, priorities=False))
 def test_a_lyapunov_function_never_grows_and_proves_boundedness(net: Net) -> None:

@@ -789,3 +789,15 @@ def test_a_run_that_ended_without_its_result_counts_once(
     assert again.selectors == both.selectors and again.generation == both.generation == 2
     counted = json.loads(Path("again.json").read_text(encoding="utf-8"))["learned"]["runs_counted"]
     assert counted == sum(t.runs + t.censored for t in once.estimates.tallies.values())
+
+
+def test_a_file_that_was_reset_says_that_it_holds_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, seen = tmp_path / "lab.db", Estimates()
+    seen.tallies[TallyKey("pick", "A", "")] = Tally().adding(Observation(Status.SUCCESS, 1.0), "t")
+    EstimatesFile(file).add(seen, {})
+    assert main(["learned", "reset", str(file)]) == 0
+    capsys.readouterr()
+    assert main(["learned", "show", str(file)]) == 0
+    assert capsys.readouterr().out == f"{file}: no run has been learned from\n"

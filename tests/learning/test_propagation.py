@@ -238,6 +238,25 @@ def test_a_recovery_that_never_ran_has_its_declared_cost(
     )
 
 
+def test_an_action_that_was_removed_does_not_count() -> None:
+    """The file still knows `old_a`: it was slow, failed often, and ran in another scenario."""
+    task = series(1)
+    known = {TallyKey("a", "do_a"): tally(90, 10, 0, 2.0)}
+    removed = {
+        TallyKey("a", "old_a"): tally(10, 0, 90, 50.0),
+        TallyKey("a", "old_a", "dark"): tally(10, 0, 90, 50.0),
+    }
+    alone, both = (propagate(task, Estimates(one)) for one in (known, known | removed))
+    assert both.parts["a"] == alone.parts["a"]
+    assert both.parts["a"].reliability.value == pytest.approx(0.9)
+    assert (both.reliability, both.cost, both.rho, both.j) == (
+        alone.reliability,
+        alone.cost,
+        alone.rho,
+        alone.j,
+    )
+
+
 def test_the_task_is_judged_in_its_hardest_scenario() -> None:
     """R and C of a primitive task are those of `learned show`: those of the worst scenario, not the
     average over all runs."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, conjuncts
 from petrobot.coordinator.analysis.execution.names import cases
+from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.engine import Phase, State
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Obstacle, in_words, obstacles
@@ -121,10 +122,7 @@ def explain(x: ExecutionGraph, state: int, still: Collection[str] = ()) -> Expla
     # What waits for another of them comes last; first, what lacks least.
     follows = _followers(net, draft, firings, lacks)
     lacks.sort(key=lambda one: (one[0].index in follows, one[2], _rank(net, one[0], one[1])))
-    told = [
-        f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in own)}"
-        for t, own, _ in lacks
-    ]
+    told = [_lacking(draft, t, own) for t, own, _ in lacks]
     more = [f"and {len(told) - MOST} more"] if len(told) > MOST else []
     known = {t.index for t, _, _ in lacks}
     fates = [
@@ -202,7 +200,7 @@ def awaiting(x: ExecutionGraph, state: int, place: str) -> str:
                 one.kind == "run" and draft.compiled.net.places[one.place or 0] == place
                 for one in found
             ):
-                return f"{t.name} {' and '.join(obstacle_text(draft, t, one) for one in found)}"
+                return _lacking(draft, t, found)
     return f"no transition takes a run of {place} that ended that way"
 
 
@@ -251,6 +249,10 @@ def _rank(net: Net, t: CompiledTransition, found: Sequence[Obstacle]) -> int:
         inhibitors = {p for p, _ in net.inhibit[t.index]}
         return 2 if all(one.place in inhibitors for one in found if one.kind == "full") else 0
     return 3 if any(one.kind == "short" for one in found) else 1
+
+
+def _lacking(draft: Draft, t: CompiledTransition, found: Sequence[Obstacle]) -> str:
+    return f"{t.name} {', and '.join(obstacle_text(draft, t, one) for one in found)}"
 
 
 def obstacle_text(draft: Draft, t: CompiledTransition, one: Obstacle) -> str:
@@ -350,8 +352,13 @@ def _fates(
         return
     name = net.places[one.place]
     if one.kind == "short":
+        most = None if x.by_hand.any() else most_tokens(net)[one.place]
+        if most and most < dict(t.needs)[one.place]:
+            yield f"{name}: it never holds more than {most}"
+            return
         left = _left_behind(net, draft, firings, t, one.place)
         yield f"{name}: {left or _fate(net, draft, firings, one.place)}"
+        yield from _stopped(x, draft, () if left else _held(net, draft, firings, one.place), known)
         return
     takers = [
         t for t, changes in enumerate(net.compiled.changes) if dict(changes).get(one.place, 0) < 0
@@ -361,12 +368,29 @@ def _fates(
     for u in () if known.intersection(takers) else takers:
         taker = x.engine.compiled.transitions[u]
         lacks = [lack for lack in obstacles(draft, taker) if lack.kind != "run"]
-        words = " and ".join(obstacle_text(draft, taker, lack) for lack in lacks)
         if lacks:
+            words = ", and ".join(obstacle_text(draft, taker, lack) for lack in lacks)
             yield f"{name}: `{taker.name}` would take some out of it, but it {words}"
         for lack in lacks:
             if lack.kind == "short":
                 yield from _fates(x, draft, firings, taker, lack, known)
+
+
+def _stopped(
+    x: ExecutionGraph, draft: Draft, places: Sequence[int], known: set[int]
+) -> Iterator[str]:
+    """Yield why nothing takes the tokens of these places on, where that is not explained yet."""
+    for p in places:
+        takers = [t for t in x.engine.compiled.transitions if p in dict(t.needs)]
+        for t in () if any(t.index in known for t in takers) else takers:
+            if lacks := [lack for lack in obstacles(draft, t) if lack.kind != "run"]:
+                yield f"{draft.compiled.net.places[p]}: {_lacking(draft, t, lacks)}"
+
+
+@lru_cache(maxsize=64)
+def most_tokens(net: Net) -> Sequence[int | None]:
+    """Return an upper bound of the tokens of each place; None if unknown."""
+    return place_bounds(net)
 
 
 def _left_behind(

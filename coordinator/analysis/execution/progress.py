@@ -33,6 +33,7 @@ from petrobot.coordinator.analysis.execution.causes import (
     explain,
     fate,
     left_over,
+    most_tokens,
     obstacle_text,
     settled,
 )
@@ -460,18 +461,20 @@ class Progress:
                 return "whenever its arcs are satisfied, others fire before its event or time comes"
         always, net, empty = set.intersection(*lacking), compiled.net, list[str]()
         for p, w in t.plain:
-            givers = self._givers(p)
-            if net.initial[p] < w and givers <= idle:
+            givers, most = self._givers(p), most_tokens(net)[p]
+            if most and most < w:
+                empty.append(f"{w} of {net.places[p]}, which never holds more than {most}")
+            elif net.initial[p] < w and givers <= idle:
                 names = ", ".join(f"`{net.transitions[u]}`" for u in sorted(givers))
                 own = f"only {names} can fill" if givers else "nothing ever fills"
                 empty.append(f"{f'{w} of ' * (w > 1)}{net.places[p]}, which {own}")
         if empty:
-            return f"it needs {' and '.join(empty)}"
+            return f"it needs {', and '.join(empty)}"
         if false := self._never_true(t):
             return false
         if always:
-            text = f"in every state at rest it {' and '.join(sorted(always))}"
-            return text + self._first_takers(t, idle)
+            text = f"in every state at rest it {', and '.join(sorted(always))}"
+            return text + self._first_takers(t, idle, len(always) > 1)
         if near:
             return f"when its tokens are there, it {' or '.join(sorted(set.union(*near)))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
@@ -507,9 +510,10 @@ class Progress:
         )
         return f"its condition ({t.when}) is never true: {' and '.join(only)}"
 
-    def _first_takers(self, t: CompiledTransition, idle: set[int]) -> str:
+    def _first_takers(self, t: CompiledTransition, idle: set[int], named: bool) -> str:
         """Return which other transitions take the tokens that come into a place, or the runs that
-        end there, so that none is left whenever the task rests; empty if there is no such place."""
+        end there, so that none is left whenever the task rests; empty if there is no such place.
+        `named`: name the place."""
         from petrobot.coordinator.engine.draft import Draft
         from petrobot.coordinator.engine.firing import Claims, eligible_runs
 
@@ -531,7 +535,9 @@ class Progress:
                 if arc is None or arc.end in {a.end for a in u.actions if a.place == p}
             ]
             if takers:
-                return f", because {' and '.join(takers)} take{'s' * (len(takers) == 1)} it first"
+                what = compiled.net.places[p] if named else "it"
+                verb = "takes" if len(takers) == 1 else "take"
+                return f", because {' and '.join(takers)} {verb} {what} first"
         return ""
 
     # --- from mission to mission --------------------------------------------------------------

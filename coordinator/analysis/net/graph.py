@@ -22,6 +22,9 @@ Index = NDArray[np.int64]
 
 SMALL = 20_000
 """Vertices plus edges up to which plain Python is faster than importing scipy."""
+WIDE = 64
+"""Vertices of a layer from which numpy is faster than plain Python. A task that counts many tokens
+down has a graph of many thousand layers of a few vertices."""
 SWEPT = 1 << 17
 """Edges of a block of a sweep."""
 
@@ -112,11 +115,19 @@ class Graph:
         front = np.flatnonzero(reached)
         while len(front):
             keep_time("verdicts")
-            at = order[ranges(row[front], row[front + 1])]
-            if edges is not None:
-                at = at[edges[at]]
-            near = self.source[at]
-            front = np.unique(near[~reached[near]])
+            if len(front) < WIDE:
+                near = set[int]()
+                for v in front.tolist():
+                    for e in order[row[v] : row[v + 1]].tolist():
+                        if (edges is None or edges[e]) and not reached[self.source[e]]:
+                            near.add(int(self.source[e]))
+                front = np.array(sorted(near), dtype=np.int64)
+            else:
+                at = order[ranges(row[front], row[front + 1])]
+                if edges is not None:
+                    at = at[edges[at]]
+                before = self.source[at]
+                front = np.unique(before[~reached[before]])
             reached[front] = True
         return reached
 
@@ -131,6 +142,15 @@ class Graph:
         front = np.array([start])
         while len(front) and not goals[front].any():
             keep_time("verdicts")
+            if len(front) < WIDE:
+                near = set[int]()
+                for v in front.tolist():
+                    for e in range(self.row[v], self.row[v + 1]):
+                        if (edges is None or edges[e]) and came[self.target[e]] == -2:
+                            came[self.target[e]] = e
+                            near.add(int(self.target[e]))
+                front = np.array(sorted(near), dtype=np.int64)
+                continue
             at = ranges(self.row[front], self.row[front + 1])
             at = at if edges is None else at[edges[at]]
             at = at[came[self.target[at]] == -2]

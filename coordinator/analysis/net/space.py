@@ -25,6 +25,7 @@ from petrobot.coordinator.analysis.net.explore import (
     Labels,
     Numbers,
 )
+from petrobot.coordinator.analysis.net.graph import WIDE
 from petrobot.coordinator.analysis.net.pack import Layout, Tokens, TooManyTokens, Words
 from petrobot.coordinator.analysis.net.structure import (
     implied_places,
@@ -36,7 +37,8 @@ from petrobot.coordinator.task.net import Marking, Net
 EngineName = Literal["auto", "integers", "numpy"]
 
 HANDOVER = 10_000
-"""Markings after which `auto` changes from plain integers to numpy."""
+"""Markings after which `auto` changes from plain integers to numpy, if enough of them wait to be
+expanded together."""
 NARROW = 8
 """Value bits that plain integers reserve for a place without a known bound (width costs them
 little)."""
@@ -215,6 +217,9 @@ def explore(
         name, found, budget = engine, _word_engine(Explored.start(net, layout, edges)), None
     try:
         reason = _run(found, limits, started, budget)
+        while budget and reason == _HAND_OVER and found.states - found.expanded < WIDE:
+            budget *= 2
+            reason = _run(found, limits, started, budget)
         if reason == _HAND_OVER:
             name, found = "numpy", _word_engine(found.explored())
             reason = _run(found, limits, started, None)

@@ -171,21 +171,45 @@ def _contains_one(support: Iterable[int], mask: int, supports: dict[int, list[in
 
 
 def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
-    """Return upper bounds of the tokens by place, from P-semiflows and capacities; None if unknown.
+    """Return upper bounds of the tokens by place, from capacities, P-semiflows and, where these
+    leave a place open, weighted sums that no firing increases; None if unknown.
 
-    y^T M = y^T M0 for every reachable M gives M(p) <= y^T M0 / y(p). Also valid with inhibitors and
-    priorities.
+    y^T M <= y^T M0 for every reachable M gives M(p) <= y^T M0 / y(p). Also valid with inhibitors
+    and priorities.
     """
     bounds = [
         limit if limit is None else max(limit, n)
         for limit, n in zip(net.capacity, net.initial, strict=True)
     ]
-    for y in (flows or place_semiflows(net)).vectors:
+    _lower(net, bounds, (flows or place_semiflows(net)).vectors)
+    if None in bounds:
+        falling = _falling(net)
+        _lower(net, bounds, falling.vectors)
+        if None in bounds and not falling.complete and (y := _programmed(net, conserved=False)):
+            _lower(net, bounds, (y,))
+    return bounds
+
+
+def _lower(net: Net, bounds: list[int | None], vectors: Iterable[Vector]) -> None:
+    """Lower the bounds of places to those of weighted sums that no firing increases."""
+    for y in vectors:
         total = sum(weight * net.initial[p] for p, weight in y.items())
         for p, weight in y.items():
             known = bounds[p]
             bounds[p] = total // weight if known is None else min(known, total // weight)
-    return bounds
+
+
+def _falling(net: Net) -> Semiflows:
+    """Return minimal y >= 0 with y^T C <= 0. Each transition has a slack row, which turns the
+    inequality into an equation."""
+    rows: list[Vector] = [{} for _ in net.places]
+    for t, changes in enumerate(net.compiled.changes):
+        for p, change in changes:
+            rows[p][t] = change
+    found = _semiflows(rows + [{t: 1} for t in range(len(net.transitions))], SMALL_EFFORT)
+    size = len(net.places)
+    of_places = ({p: n for p, n in y.items() if p < size} for y in found.vectors)
+    return Semiflows(tuple(y for y in of_places if y), found.complete)
 
 
 def implied_places(flows: Semiflows, bounds: Sequence[int | None]) -> frozenset[int]:
@@ -224,9 +248,8 @@ def lyapunov(net: Net) -> Lyapunov:
     """Return a positive integer y with y^T C <= 0, or whether it is known that there is none.
 
     Three ways, in this order: the sum of all P-semiflows if they cover the places; the sum of the
-    minimal y >= 0 with y^T C <= 0 if their enumeration stays small (each transition gets a slack
-    row, which turns the inequality into an equation); linear programs for y and for firing counts
-    that exclude it, whose solutions are rounded to fractions and checked exactly.
+    minimal y >= 0 with y^T C <= 0 if their enumeration stays small; linear programs for y and for
+    firing counts that exclude it, whose solutions are rounded to fractions and checked exactly.
     """
     flows = place_semiflows(net)
     if flows.covers(len(net.places)):
@@ -234,12 +257,7 @@ def lyapunov(net: Net) -> Lyapunov:
         for y in flows.vectors:
             total = _combined(total, 1, y, 1)
         return Lyapunov(total, True, True)
-    rows: list[Vector] = [{} for _ in net.places]
-    for t, changes in enumerate(net.compiled.changes):
-        for p, change in changes:
-            rows[p][t] = change
-    slack: list[Vector] = [{t: 1} for t in range(len(net.transitions))]
-    falling = _semiflows(rows + slack, SMALL_EFFORT)
+    falling = _falling(net)
     weights: Vector | None
     if falling.complete:
         weights = {p: sum(y.get(p, 0) for y in falling.vectors) for p in range(len(net.places))}

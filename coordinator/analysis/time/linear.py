@@ -80,6 +80,7 @@ def _waves(outer: Graph) -> Index:
     wave = np.zeros(outer.n, dtype=np.int64)
     front, depth = np.flatnonzero(left == 0), 0
     while len(front):
+        keep_time("linear system")
         wave[front] = depth
         edges = order[ranges(first[front], first[front + 1])]
         before = outer.source[edges]

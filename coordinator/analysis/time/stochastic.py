@@ -1126,10 +1126,10 @@ class _Derivation:
         """Return how often an open condition is true, relative to its competitors."""
         known = self.measured.switches.get(t.name)
         if known is None:
-            often = "true as often as those it competes with"
+            text = "its condition is assumed to be true as often as those it competes with"
             if self._rivals(t) & set(self.measured.switches):
-                often = "true once in all that was measured, where it was never seen to be"
-            self.assumptions.append(f"{t.name}: its condition is assumed to be {often}")
+                text = "its condition was never measured to be true; assumed: once in all runs"
+            self.assumptions.append(f"{t.name}: {text}")
         if known is None or not t.events:
             return 1.0 if known is None else known
         # The rate of an event is multiplied by it, so it must be 1 on average.

@@ -181,8 +181,8 @@ class Forecast:
 
     @cached_property
     def completion_error(self) -> float:
-        """Bound of the relative error of P_complete that solving left: residuals of its equation,
-        each weighted with the expected visits to its marking.
+        """Bound of the relative error of P_complete that solving left: residuals of its equation
+        and the rounding of its terms, each weighted with the expected visits to its marking.
 
         With h' the exact solution, h' - h = (I - A)^-1 r, and row 0 of that inverse are the
         expected visits. So the bound holds for probabilities of any size.
@@ -193,6 +193,9 @@ class Forecast:
         inside = (h > 0) & ~self.done.goal
         ahead = np.where(inside[chain.source], chain.probability * h[chain.target], 0.0)
         off = np.abs(sum_by(chain.source, ahead, chain.n) - np.where(inside, h, 0.0))
+        # Terms are positive: a row of n terms is rounded by at most n + 1, its coefficients by 2.
+        terms = np.bincount(chain.source, minlength=chain.n)
+        off += np.finfo(np.float64).eps * (terms + 3) * h
         visits = visits_before(chain, inside)
         return float(np.where(inside, visits * off, 0.0).sum() / h[0])
 

@@ -26,6 +26,7 @@ from petrobot.coordinator.studies.campaign.observed import context_of, observati
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import NET, TRIALS, Request, predict
+from petrobot.coordinator.studies.forecast.residual import overlapping
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 from petrobot.services.host.json_text import finite, json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
@@ -87,7 +88,9 @@ def register(
                 if unlike := unlike_trials(regimes[name], regimes[name]["gspn"]):
                     regimes[name]["gspn"] = {"why": unlike}
                 elif "why" not in regimes[name]["gspn"]:
-                    regimes[name]["gspn"]["notes"] += _rough(regimes[name])
+                    regimes[name]["gspn"]["notes"] += _rough(
+                        regimes[name], bool(overlapping(trainings[name]))
+                    )
                 doubts = contradictions(regimes[name], regimes[name]["gspn"])
                 if doubts and not _views_miss(trainings[name], estimates, name, cell):
                     regimes[name]["doubts"] += doubts
@@ -255,19 +258,21 @@ def _apart(said: Mapping[str, Any], view: Mapping[str, Any]) -> list[tuple[str, 
     return out
 
 
-def _rough(regime: Mapping[str, Any]) -> list[str]:
+def _rough(regime: Mapping[str, Any], overlap: bool) -> list[str]:
     """Return a note if the quantile of the view is not that of the forecast, whose durations are
-    not fitted."""
+    not fitted, and whose trials may `overlap`."""
     own, other = regime["figures"].get("q90"), regime["gspn"]["q90"]
     if own is None or own["value"] is None or other is None:
         return []
     low, high = own["confidence"]
     if low <= other <= high or abs(other - own["value"]) <= MATTERS * own["value"]:
         return []
+    outside = "doubtful: its 90 % quantile is outside the interval above, because"
+    if overlap:
+        return [f"{outside} trials of the training overlapped, and the view has one at a time"]
     return [
-        "doubtful: its 90 % quantile is outside the interval above, because durations are fitted "
-        f"by their mean and deviation with at most {STAGES} phases, and statuses of one trial are "
-        "taken as independent"
+        f"{outside} durations are fitted by their mean and deviation with at most {STAGES} phases, "
+        "and statuses of one trial are taken as independent"
     ]
 
 

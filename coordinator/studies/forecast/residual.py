@@ -264,13 +264,16 @@ def _means(values: Values, unit: Codes) -> Values:
 
 
 def overlapping(training: Training) -> int:
-    """Return how many trials began before an earlier one of their mission run had ended."""
+    """Return how many trials began before an earlier one of their mission run had ended, where
+    these are more than a negligible part; else 0."""
+    if not training.whole:
+        return 0
     count, end, before = 0, 0.0, -1
     for trial, mission in zip(training.trials, missions(training), strict=True):
         end, before = (end if mission == before else 0.0), mission
         count += trial.begun < end - EXACT
         end = max(end, trial.begun + (trial.time or 0.0))
-    return count
+    return count if count > NEGLIGIBLE * len(training.trials) else 0
 
 
 def order_doubts(training: Training) -> list[str]:
@@ -279,13 +282,12 @@ def order_doubts(training: Training) -> list[str]:
     trials are independent and alike."""
     if not training.whole:
         return []
-    n, both = len(training.trials), overlapping(training)
-    if both > NEGLIGIBLE * n:
+    if both := overlapping(training):
         return [
-            f"{both} of the training's {n} trials began before an earlier one had ended: their "
-            "times contain waits for each other, so they hold for as many runs at a time, and the "
-            "stochastic view, which has one, does not show them; without `runs_place` a trial is "
-            "the whole mission, which has no such waits"
+            f"{both} of the training's {len(training.trials)} trials began before an earlier one "
+            "had ended: their times contain waits for each other, so they hold for as many runs at "
+            "a time, and the stochastic view, which has one, does not show them; without "
+            "`runs_place` a trial is the whole mission, which has no such waits"
         ]
     real, found, mission = measured(training), [], missions(training)
     done = ~np.isnan(real.time)

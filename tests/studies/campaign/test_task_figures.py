@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from petrobot.coordinator.cli.campaign import text_of
+from petrobot.coordinator.cli.learned_show import task_line
+from petrobot.coordinator.learning.objective import Question, compare, task_figures
 from petrobot.coordinator.learning.propagation import propagate
 from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.table import TrialRow
@@ -105,6 +107,24 @@ def test_a_given_rho_is_used_and_unknown_costs_are_not_guessed() -> None:
     found = Summary.of(TASK, some).to_plain()["task_figures"]
     assert found["regime"] == "B" and found["R_conj"] is not None
     assert found["C"] is None and found["J"] is None and found["J_interval"] is None
+
+
+def test_j_needs_a_cost_of_each_primitive_task() -> None:
+    """After `learned reset` of one primitive task its cost is unknown, and so is 1 / C; it was
+    taken as 0."""
+    made = Summary.of(TASK, rows(100))
+    trials, measures = (
+        made.estimates.trials_of(TASK.name),
+        dict.fromkeys(TASK.primitive_tasks, "wall"),
+    )
+    name = next(iter(TASK.primitive_tasks))
+    compared = {**made.comparisons(), name: compare({}, Question())}
+    found = task_figures(trials, measures, compared, None)
+    given = task_figures(trials, measures, compared, 0.7)
+    assert found is not None and given is not None
+    assert found.cost == given.cost is not None
+    assert (found.rho, found.j) == (None, None) and given.rho == 0.7 and given.j is not None
+    assert "J needs a --rho" in task_line(found.to_plain())
 
 
 def test_the_result_shows_them() -> None:
