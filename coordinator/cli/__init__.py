@@ -15,6 +15,7 @@ from typing import NoReturn
 
 from petrobot.services.host.command_line import leave_threads
 from petrobot.services.host.emergency_latch import uptime
+from petrobot.services.host.toml_text import InputError
 
 EXIT_CODES = """\
 exit codes:
@@ -52,12 +53,12 @@ FILE_FAULTS = {
 """What to do about a file that cannot be written, by errno(3), unless the command says more."""
 
 
-class CommandError(Exception):
+class CommandError(InputError):
     """A command cannot continue: its exit code, and the text to print."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(code, text)
-        self.code, self.text = code, text
+        self.exit_code, self.text = code, text
 
     def __str__(self) -> str:
         return self.text
@@ -175,7 +176,7 @@ def _safe_main(arguments: list[str], ordered: float) -> int:
     except KeyboardInterrupt:  # also while modules are imported: that takes longest
         print("interrupted", file=sys.stderr)
         return 130
-    except (BrokenPipeError, CommandError, SystemExit) as fault:
+    except (BrokenPipeError, InputError, SystemExit) as fault:
         # A command may have made bad input of it, and rich ends the process with 1.
         if not isinstance(fault.__context__ or fault, BrokenPipeError):
             raise
@@ -265,15 +266,15 @@ def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> 
         log_to_stderr(level)
     try:
         return _run(found.run, options)
-    except CommandError as fault:
+    except InputError as fault:
         if isinstance(fault.__cause__, BrokenPipeError):
             raise
         print(f"petrobot {command.name}: {fault}", file=sys.stderr)
-        return fault.code
+        return fault.exit_code
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
-    """Run a command. Keys and files that cannot be used are bad input in every command."""
+    """Run a command. Files that cannot be used are bad input in every command."""
     try:
         return int(run(options))
     except OSError as fault:
@@ -281,9 +282,3 @@ def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) 
             raise
         what = f"{fault.filename}: {fault.strerror}" if fault.filename else str(fault.strerror)
         raise CommandError(2, f"{what}; {FILE_FAULTS[fault.errno]}") from fault
-    except Exception as fault:
-        from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
-
-        if isinstance(fault, KeyFileError | KeyNeededError):
-            raise CommandError(2, str(fault)) from fault
-        raise

@@ -34,6 +34,7 @@ from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import EarlyEvent, End, EventMemory, Kind, Status, Task, Transition
 from petrobot.coordinator.task.conditions import Domain, Expression, equivalent
 from petrobot.coordinator.task.validation import condition_domains, marking_domains
+from petrobot.services.host.toml_text import InputError
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -47,7 +48,7 @@ CUT = 1
 STATUSES: Final[tuple[Status, ...]] = tuple(Status)
 
 
-class ForecastError(Exception):
+class ForecastError(InputError):
     """A forecast file cannot be made or used; the text says why."""
 
 
