@@ -33,8 +33,11 @@ from petrobot.coordinator.analysis.net.space import INTERRUPTED, SearchLimits, e
 from petrobot.coordinator.analysis.report import CUT, FULL, LATE, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
-from petrobot.coordinator.analysis.time.measures import Measure as UserMeasure
-from petrobot.coordinator.analysis.time.measures import read_measures, value_of
+from petrobot.coordinator.analysis.time.measures import (
+    Measure as UserMeasure,
+    read_measures,
+    value_of,
+)
 from petrobot.coordinator.analysis.time.simulate import (
     IntervalEstimate,
     Simulation,

@@ -44,8 +44,12 @@ from petrobot.coordinator.learning.trial_tokens import NOBODY, TrialTokens
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Executed, Status, Task
-from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
-from petrobot.coordinator.task.conditions import parse as parse_condition
+from petrobot.coordinator.task.conditions import (
+    ConditionError,
+    ConditionFault,
+    Expression,
+    parse as parse_condition,
+)
 from petrobot.services.comm.protocol.messages import Feedback
 
 LARGEST = 1e150

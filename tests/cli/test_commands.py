@@ -19,8 +19,7 @@ import pytest
 from petrobot.coordinator.analysis import commands, may_run
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
-from petrobot.coordinator.cli import COMMANDS, Subcommand, loading, main
-from petrobot.coordinator.cli import analyse as cli_analyse
+from petrobot.coordinator.cli import COMMANDS, Subcommand, analyse as cli_analyse, loading, main
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]

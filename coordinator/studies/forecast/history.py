@@ -17,8 +17,7 @@ from petrobot.coordinator.analysis.may_run import Cell, devices_of
 from petrobot.coordinator.analysis.net.ordinary import contended
 from petrobot.coordinator.analysis.time.measured import LATE, is_cause
 from petrobot.coordinator.analysis.time.whatif import Change
-from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
-from petrobot.coordinator.learning.estimate import Tally
+from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE, Tally
 from petrobot.coordinator.learning.estimates_file import (
     EstimatesError,
     EstimatesFile,
