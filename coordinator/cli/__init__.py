@@ -8,7 +8,8 @@ import errno
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -62,6 +63,15 @@ class CommandError(InputError):
 
     def __str__(self) -> str:
         return self.text
+
+
+@contextmanager
+def file_of(path: object, remedy: str) -> Iterator[None]:
+    """Turn an OSError about a file or folder, such as a full disk, into CommandError."""
+    try:
+        yield
+    except OSError as fault:
+        raise CommandError(2, f"{path}: {fault.strerror or fault}; {remedy}") from fault
 
 
 PIPE_CLOSED = 128 + 13

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.services.host.command_line import LARGEST_SEED, whole
 from petrobot.services.host.json_text import json_text
@@ -324,13 +324,8 @@ def load_directory(given: Path | None, dry_run: bool = False) -> Directory:
     from petrobot.services.comm.location_file import load
 
     path = services_path(given)
-    try:
+    with file_of(path, "give --services a location file that can be read"):
         directory = load(path, dry_run)
-    except OSError as fault:
-        text = (
-            f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
-        )
-        raise CommandError(2, text) from fault
     if dry_run:
         from petrobot.services.comm.location_file import read_text
         from petrobot.services.comm.location_file.code import code_faults, read_code
@@ -426,10 +421,6 @@ def write_json(path: str, data: Any, give: str = "--json a file") -> None:
     if path == "-":
         print(text, end="")
         return
-    try:
+    with file_of(path, f"give {give} that can be written"):
         make_folder(Path(path).parent)
         write_whole(Path(path), text)
-    except OSError as fault:
-        raise CommandError(
-            2, f"{path}: {fault.strerror or fault}; give {give} that can be written"
-        ) from fault

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
 from petrobot.coordinator.cli.options import recorded, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
@@ -66,20 +66,12 @@ def run(options: argparse.Namespace) -> int:
     if options.mcap is not None:
         why = "--mcap names the file and the format; leave this out"
         refuse_idle(options, why, idle={"format", "out"})
-    try:
+    with file_of(options.mcap or options.out, "name a file that can be written"):
         if options.mcap is not None:
             _write_mcap(options.mcap, found)
-            return 0
-        _write(
-            options.out,
-            _text(found) if options.format == "text" else _exported(options.format, found),
-        )
-    except OSError as fault:
-        text = (
-            f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that "
-            "can be written"
-        )
-        raise CommandError(2, text) from fault
+        else:
+            text = options.format == "text"
+            _write(options.out, _text(found) if text else _exported(options.format, found))
     return 0
 
 

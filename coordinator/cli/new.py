@@ -10,7 +10,7 @@ import keyword
 import re
 from pathlib import Path
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import SHIPPED_CELL
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -182,9 +182,6 @@ def _write(files: dict[Path, str]) -> None:
         if path.exists():
             raise CommandError(2, f"{path} exists already; choose another name or --folder")
     for path, text in files.items():
-        try:
+        with file_of(path, "give --folder one that can be written"):
             make_folder(path.parent)
             write_whole(path, text)
-        except OSError as fault:
-            text = f"{path}: {fault.strerror or fault}; give --folder one that can be written"
-            raise CommandError(2, text) from fault

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import add_json_argument, load_task, pictures_of, write_json
 from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.whole_file import make_folder, write_whole
@@ -83,15 +83,11 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
 
     beside = page.with_name(f"{page.stem}_pictures")
     missing = unavailable()
-    try:
+    with file_of(page, "give --out a file that can be written"):
         make_folder(beside)
         write_whole(page, html)
         for name, svg in pictures.items():
             _draw(beside / name, standalone(svg), raster=not missing)
-    except OSError as fault:
-        raise CommandError(
-            2, f"{page}: {fault.strerror or fault}; give --out a file that can be written"
-        ) from fault
     if not quiet:
         print(f"report: {page}")
         print(f"pictures: {beside} ({len(pictures)} as SVG{'' if missing else ' and PNG'})")
