@@ -429,8 +429,8 @@ class LearningSelector(FirstAlternative):
         measure = {p: self.learning.question(p).measure for p in self.learning.task.primitive_tasks}
         if self._declared is not None:  # in lock step no measured time may influence a choice
             runs = [
-                (name, action, context, end if measure[name] == "cpu" else _without_cpu(end))
-                for name, action, context, end in runs
+                (p, action, c, end if measure[p] == "cpu" else replace(end, cpu_seconds=None))
+                for p, action, c, end in runs
             ]
         for verdict in verdicts_of_task(runs, bool(trial.met), trial.seconds, measure.__getitem__):
             self._note(replace(verdict, beside=()) if late else verdict)
@@ -459,10 +459,6 @@ class LearningSelector(FirstAlternative):
             self._replace(end.outcome, corrected.status)
             what = (end.primitive_task, end.action, end.context, end.outcome)
             self._note(Correction(*what, corrected.status, corrected.cause))
-
-
-def _without_cpu(end: Observation) -> Observation:
-    return replace(end, cpu_seconds=None)
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

@@ -358,7 +358,8 @@ class Mission:
     def start(self, now: float) -> None:
         """Start, with all nodes connected: prepare the cell, or begin at once if there is nothing
         to prepare."""
-        if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
+        asked = {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
+        if not self._ask(now, "prepare", self.executor.task.prepare, asked):
             self._begin(now)
         else:
             self.stage = Stage.PREPARING
@@ -462,9 +463,6 @@ class Mission:
         return {**general, **self.score, **durations}
 
     # --- stages -------------------------------------------------------------------------------
-
-    def _preparation(self) -> dict[str, Any]:
-        return {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
 
     def _begin(self, now: float) -> None:
         self.stage, self.begun = Stage.RUNNING, now
