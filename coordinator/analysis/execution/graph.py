@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.names import (
+    REASON,
     Cause,
     Names,
     Orders,
@@ -113,6 +114,12 @@ class Step:
     firings: tuple[str, ...]
     stimulus: Stimulus = field(compare=False)
     """The first one found."""
+
+    @property
+    def reason(self) -> str:
+        """Return the reason of a run that ended, as text; empty where no condition reads it."""
+        end = self.stimulus
+        return repr(end.cause) if isinstance(end, RunEnded) and REASON in self.text else ""
 
     @property
     def fails(self) -> bool:
