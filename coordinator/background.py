@@ -176,7 +176,7 @@ def analysed(
     from dataclasses import replace
 
     from petrobot.coordinator.analysis.may_run import BUDGET, Cell, devices_of
-    from petrobot.coordinator.analysis.report import analyse, with_forecast
+    from petrobot.coordinator.analysis.report import AnalysisRequest, analyse, with_forecast
     from petrobot.coordinator.learning.propagation import newest_measured
     from petrobot.coordinator.operator.task_check import judge_text
     from petrobot.coordinator.task.file import loads
@@ -191,7 +191,7 @@ def analysed(
         found = analyse(task, limits=limits, steps=BUDGET.steps, devices=devices)
     yield _shown(found, known) | more
     measured, source = newest_measured(estimates, task, devices, plant)
-    timed = with_forecast(found, task, measured=measured, limits=limits, devices=devices)
+    timed = with_forecast(found, task, AnalysisRequest(measured, limits=limits, devices=devices))
     if source and timed.forecast is not None:
         timed = replace(timed, notes=(*timed.notes, source))
     yield _shown(timed, known) | more

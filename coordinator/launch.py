@@ -44,7 +44,7 @@ from petrobot.services.comm.lockstep.mesh import Member, cell_key
 from petrobot.services.comm.lockstep.party import Party
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
-from petrobot.services.host.toml_text import key_lines, line_of
+from petrobot.services.host.toml_text import InputError, key_lines, line_of
 
 NODE_PARTY = "petrobot.services.node.lockstep:LockstepNode"
 SCRIPTED = "petrobot.services.scripted:load"
@@ -66,7 +66,7 @@ class Setting:
     """Where a simulated run sets out, if not at the task's beginning."""
 
 
-class RequestError(ValueError):
+class RequestError(InputError, ValueError):
     """A run cannot be made as it was asked for: which part of the request, and what to do."""
 
 

@@ -27,8 +27,7 @@ from petrobot.services.host.command_line import (
 )
 from petrobot.services.host.parent_death import die_with, wanted_with_parent
 from petrobot.services.node.realtime import serve
-from petrobot.services.scripted import ScriptError
-from petrobot.services.scripted import load as load_script
+from petrobot.services.scripted import ScriptError, load as load_script
 
 EXAMPLE = "example:\n  python -m petrobot.services vision --services services.toml"
 

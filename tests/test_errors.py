@@ -13,7 +13,7 @@ import pytest
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.background import RefusedError, Superseded
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskText
+from petrobot.coordinator.page.task_store import Conflict, TaskText
 from petrobot.coordinator.run.mission import MissionError
 from petrobot.coordinator.run.realtime import UnreachableError
 from petrobot.coordinator.task.conditions.language import ConditionError
@@ -44,7 +44,6 @@ RAISED = [
     PartyLostError("arm", "no Tick for 5 s"),
     RefusedError(422, "the task cannot be drawn", {"line": 3}),
     Superseded(),
-    StoreError(403, "the folder cannot be written"),
     Conflict(TaskText("a.toml", "theirs"), "yours"),
     CommandError(2, "no such task"),
     ArmError("not_reached", "it stands 3 mm beside"),

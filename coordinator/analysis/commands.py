@@ -33,8 +33,11 @@ from petrobot.coordinator.analysis.net.space import INTERRUPTED, SearchLimits, e
 from petrobot.coordinator.analysis.report import CUT, FULL, LATE, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.measured import Measured, NoEstimate
-from petrobot.coordinator.analysis.time.measures import Measure as UserMeasure
-from petrobot.coordinator.analysis.time.measures import read_measures, value_of
+from petrobot.coordinator.analysis.time.measures import (
+    Measure as UserMeasure,
+    read_measures,
+    value_of,
+)
 from petrobot.coordinator.analysis.time.simulate import (
     IntervalEstimate,
     Simulation,
@@ -142,12 +145,13 @@ def analyse_command(
         subject, name, notes = _subject(model, rates, view)
         cell = _cell(model, cell_of)
         known = _measured(model, measure, cell)
-        notes = (*notes, *_assumed(model, cell))
+        notes = (*notes, assumed(cell)) if isinstance(model, Task) else notes
         wanted = [read_change(text) for text in changes]
         plain = model.net if isinstance(model, NetFile) and rates is not None else None
         asked: list[tuple[Subject, Measured | None, Net | None]] = [(subject, known, plain)]
         if wanted:
-            tokens = plain and change_net(plain, _tokens_of(plain, wanted))
+            of_tokens = [c for c in wanted if plain and ".".join(c.subject) in plain.place_index]
+            tokens = plain and change_net(plain, of_tokens)
             asked.append((*_changed(subject, known, wanted), tokens))
         analyses: list[Analysis] = []
         for (one, measured, ordinary), (ends, searched) in zip(asked, deadlines, strict=True):
@@ -298,11 +302,6 @@ def _refused(path: Path, error: Exception) -> CommandResult:
     return CommandResult(BAD_INPUT, told, {"error": told})
 
 
-def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
-    """Return the changes that concern tokens."""
-    return [change for change in changes if ".".join(change.subject) in net.place_index]
-
-
 def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
     """Return the analysis with its data and text.
 
@@ -339,11 +338,6 @@ Subject = Task | Net | Gspn
 def _cell(model: Task | NetFile, cell_of: CellOf | None) -> Cell | None:
     """Return the cell of a task; a net of another tool has none."""
     return cell_of(model) if cell_of is not None and isinstance(model, Task) else None
-
-
-def _assumed(model: Task | NetFile, cell: Cell | None) -> tuple[str, ...]:
-    """Say which cell is assumed for a task."""
-    return (assumed(cell),) if isinstance(model, Task) else ()
 
 
 def _measured(model: Task | NetFile, measure: Measure | None, cell: Cell | None) -> Measured:

@@ -514,6 +514,17 @@ class Analysis:
         ]
 
 
+@dataclass(frozen=True, slots=True)
+class AnalysisRequest:
+    """How a task is analysed; `analyse` explains the fields."""
+
+    measured: Measured | None = None
+    stages: int = 8
+    limits: SearchLimits | None = None
+    steps: int = STEPS
+    devices: Mapping[str, str] | None = None
+
+
 def analyse(
     model: Net | Task | Gspn,
     *,
@@ -536,7 +547,8 @@ def analyse(
     actions that has one.
     """
     if isinstance(model, Task):
-        return _analyse_task(model, view, measured, stages, limits, steps, devices)
+        request = AnalysisRequest(measured, stages, limits, steps, devices)
+        return _analyse_task(model, view, request)
     net = ordinary or (model.net if isinstance(model, Gspn) else model)
     notes: list[str] = []
     found = _examined(net, limits, notes)
@@ -637,20 +649,13 @@ def _long_run(
 
 
 def _analyse_task(
-    task: Task,
-    view: str,
-    measured: Measured | None,
-    stages: int,
-    limits: SearchLimits | None,
-    steps: int,
-    devices: Mapping[str, str] | None,
-    shared: Shared | None = None,
+    task: Task, view: str, asked: AnalysisRequest, shared: Shared | None = None
 ) -> Analysis:
     """Analyse a task. `shared` is that of the same task with more runs; None: it is the first, so
     that fewer runs may be tried, too."""
-    fewer, shared = shared is None, shared or Shared()
+    fewer, shared, steps = shared is None, shared or Shared(), asked.steps
     ordinary, n, notes = OrdinaryView(task), ends_net(task), list[str]()
-    found = _examined(n.net, limits, notes, partial(judged, n))
+    found = _examined(n.net, asked.limits, notes, partial(judged, n))
     progress = None
     shown: Mapping[str, PropertyVerdict] = {}
     why = "the analysis was stopped before"
@@ -659,10 +664,10 @@ def _analyse_task(
             # An unbounded net seldom has a finite execution graph, but its dead ends may be near.
             most = steps if found.bounded.holds is not False else min(steps, LOOK)
             try:
-                progress = progress_of(ordinary, most, measured, devices, shared)
+                progress = progress_of(ordinary, most, asked.measured, asked.devices, shared)
                 x = progress.x
                 if most < steps and not x.complete and x.growth is None:
-                    progress = progress_of(ordinary, steps, measured, devices, shared)
+                    progress = progress_of(ordinary, steps, asked.measured, asked.devices, shared)
                 notes += progress.notes
             except TooManyValues as fault:
                 why = str(fault)
@@ -691,7 +696,7 @@ def _analyse_task(
         n,
     )
     if fewer and not (judgement.interrupted or judgement.objections):
-        smaller = _with_fewer_runs(task, progress, limits, steps, devices, shared)
+        smaller = _with_fewer_runs(task, progress, asked, shared)
         judgement = replace(judgement, fewer=smaller)
         runs = task.places.get(task.runs_place)  # None of them was asked where no time was left.
         complete = progress is not None and progress.x.complete
@@ -700,18 +705,11 @@ def _analyse_task(
             judgement = replace(judgement, notes=(*judgement.notes, note))
     if view != "gspn" or judgement.interrupted:
         return judgement
-    return with_forecast(
-        judgement, task, measured=measured, stages=stages, limits=limits, devices=devices
-    )
+    return with_forecast(judgement, task, asked)
 
 
 def _with_fewer_runs(
-    task: Task,
-    progress: Progress | None,
-    limits: SearchLimits | None,
-    steps: int,
-    devices: Mapping[str, str] | None,
-    shared: Shared,
+    task: Task, progress: Progress | None, asked: AnalysisRequest, shared: Shared
 ) -> dict[int, Analysis]:
     """Return the analyses of a task with one run, then two, up to a fault or a graph that is too
     large, within the same limits; empty if its own graph is complete or it does not count runs."""
@@ -721,32 +719,22 @@ def _with_fewer_runs(
     for runs in range(1, min(place.tokens, FEWER + 1)):
         places = {**task.places, place.name: replace(place, tokens=runs)}
         smaller = replace(task, places=places)
-        one = _analyse_task(smaller, "", None, STAGES, limits, steps, devices, shared)
+        one = _analyse_task(smaller, "", replace(asked, measured=None), shared)
         found[runs] = one
         if one.objections or one.progress is None or not one.progress.x.complete:
             break
     return found
 
 
-def with_forecast(
-    found: Analysis,
-    task: Task,
-    *,
-    measured: Measured | None = None,
-    stages: int = 8,
-    limits: SearchLimits | None,
-    devices: Mapping[str, str] | None,
-) -> Analysis:
+def with_forecast(found: Analysis, task: Task, asked: AnalysisRequest) -> Analysis:
     """Return the analysis of a task with its forecast, as `analyse` with `view="gspn"` does, and
     without searching again."""
     notes, doubts = list(found.notes), list[str]()
     numbers = exact = missions = None
     try:
-        numbers = _forecast(task, measured, stages, limits, notes, devices)
+        numbers = _forecast(task, asked, notes)
         if numbers is not None:
-            doubts, exact, missions = _doubts(
-                numbers, found.progress, measured, stages, limits, notes, devices
-            )
+            doubts, exact, missions = _doubts(numbers, found.progress, asked, notes)
     except KeyboardInterrupt:
         notes.append(CUT)
     return replace(
@@ -760,17 +748,10 @@ def with_forecast(
     )
 
 
-def _forecast(
-    task: Task,
-    measured: Measured | None,
-    stages: int,
-    limits: SearchLimits | None,
-    notes: list[str],
-    devices: Mapping[str, str] | None,
-) -> Forecast | None:
+def _forecast(task: Task, asked: AnalysisRequest, notes: list[str]) -> Forecast | None:
     try:
-        view = stochastic_view(task, measured, stages=stages, devices=devices)
-        found = forecast(view, limits=limits)
+        view = stochastic_view(task, asked.measured, stages=asked.stages, devices=asked.devices)
+        found = forecast(view, limits=asked.limits)
         _ = found.worth, found.recovery_time, found.throughput, found.mean_tokens
     except (ValueError, ArithmeticError, *OUT_OF_MEMORY) as why:
         if INTERRUPTED in str(why):
@@ -792,13 +773,7 @@ about 1e-12."""
 
 
 def _doubts(
-    found: Forecast,
-    progress: Progress | None,
-    measured: Measured | None,
-    stages: int,
-    limits: SearchLimits | None,
-    notes: list[str],
-    devices: Mapping[str, str] | None,
+    found: Forecast, progress: Progress | None, asked: AnalysisRequest, notes: list[str]
 ) -> tuple[list[str], MissionFigures | None, MissionFigures | None]:
     """Compare a forecast with the execution graph as a Markov chain, which follows the engine in
     everything but durations, and with missions played on it, whose durations are not divided into
@@ -809,8 +784,8 @@ def _doubts(
     doubts, failed = list(found.view.doubts), dict[str, str]()
     exact, missions = list[MissionFigures](), list[MissionFigures]()
     there: Mapping[str, Callable[[Progress], list[str]]] = {
-        "the execution graph": partial(_as_chain, found, measured, stages, limits, devices),
-        "missions with exact times": partial(_as_played, found, measured, stages, exact, missions),
+        "the execution graph": partial(_as_chain, found, asked),
+        "missions with exact times": partial(_as_played, found, asked, exact, missions),
     }
     for what, compared in there.items():
         try:
@@ -831,14 +806,7 @@ def _apart(one: float, other: float) -> tuple[str, str]:
     return next((pair for pair in texts if pair[0] != pair[1]), (f"{one:g}", f"{other:g}"))
 
 
-def _as_chain(
-    found: Forecast,
-    measured: Measured | None,
-    stages: int,
-    limits: SearchLimits | None,
-    devices: Mapping[str, str] | None,
-    progress: Progress,
-) -> list[str]:
+def _as_chain(found: Forecast, asked: AnalysisRequest, progress: Progress) -> list[str]:
     """Return which figures the execution graph has otherwise. Both get as many phases for a
     duration as the chain can have, so only what they say about the order of events can differ.
     Raises ValueError."""
@@ -846,9 +814,11 @@ def _as_chain(
     if isinstance(chain := progress.chain, str):
         raise ValueError(chain)
     few = chain.stages
-    if (few, few) != (stages, STAGES):
-        same = stochastic_view(view.task, measured, stages=few, timer_stages=few, devices=devices)
-        found = forecast(same, limits=limits)
+    if (few, few) != (asked.stages, STAGES):
+        same = stochastic_view(
+            view.task, asked.measured, stages=few, timer_stages=few, devices=asked.devices
+        )
+        found = forecast(same, limits=asked.limits)
     exact = chain.figures
     off = [
         "{} {} here, {} there".format(name, *_apart(value, exact[name]))
@@ -874,8 +844,7 @@ def _as_chain(
 
 def _as_played(
     found: Forecast,
-    measured: Measured | None,
-    stages: int,
+    asked: AnalysisRequest,
     exact: list[MissionFigures],
     missions: list[MissionFigures],
     progress: Progress,
@@ -884,7 +853,7 @@ def _as_played(
     five standard errors, and the execution graph as a chain does not tell them right either: what
     phases do. Then append those missions to `exact`, and in any case to `missions`. Raises
     NoEstimate, TooLarge and OutOfTime."""
-    plays, off, chain = played(progress.x, measured), list[str](), progress.chain
+    plays, off, chain = played(progress.x, asked.measured), list[str](), progress.chain
     missions.append(plays)
     for name, value in found.figures.items():
         mean, error = plays.figures[name]
@@ -898,7 +867,7 @@ def _as_played(
     exact.append(plays)
     return [
         f"{plays.missions} missions of the execution graph with exact times have other figures: "
-        f"{', '.join(off)}. Here a timer or a duration has at most {stages} phases"
+        f"{', '.join(off)}. Here a timer or a duration has at most {asked.stages} phases"
     ]
 
 

@@ -8,13 +8,15 @@ import errno
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
 from petrobot.services.host.command_line import leave_threads
 from petrobot.services.host.emergency_latch import uptime
+from petrobot.services.host.toml_text import InputError
 
 EXIT_CODES = """\
 exit codes:
@@ -52,15 +54,24 @@ FILE_FAULTS = {
 """What to do about a file that cannot be written, by errno(3), unless the command says more."""
 
 
-class CommandError(Exception):
+class CommandError(InputError):
     """A command cannot continue: its exit code, and the text to print."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(code, text)
-        self.code, self.text = code, text
+        self.exit_code, self.text = code, text
 
     def __str__(self) -> str:
         return self.text
+
+
+@contextmanager
+def file_of(path: object, remedy: str) -> Iterator[None]:
+    """Turn an OSError about a file or folder, such as a full disk, into CommandError."""
+    try:
+        yield
+    except OSError as fault:
+        raise CommandError(2, f"{path}: {fault.strerror or fault}; {remedy}") from fault
 
 
 PIPE_CLOSED = 128 + 13
@@ -175,7 +186,7 @@ def _safe_main(arguments: list[str], ordered: float) -> int:
     except KeyboardInterrupt:  # also while modules are imported: that takes longest
         print("interrupted", file=sys.stderr)
         return 130
-    except (BrokenPipeError, CommandError, SystemExit) as fault:
+    except (BrokenPipeError, InputError, SystemExit) as fault:
         # A command may have made bad input of it, and rich ends the process with 1.
         if not isinstance(fault.__context__ or fault, BrokenPipeError):
             raise
@@ -265,15 +276,15 @@ def _dispatch(command: Subcommand, arguments: Sequence[str], ordered: float) -> 
         log_to_stderr(level)
     try:
         return _run(found.run, options)
-    except CommandError as fault:
+    except InputError as fault:
         if isinstance(fault.__cause__, BrokenPipeError):
             raise
         print(f"petrobot {command.name}: {fault}", file=sys.stderr)
-        return fault.code
+        return fault.exit_code
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
-    """Run a command. Keys and files that cannot be used are bad input in every command."""
+    """Run a command. Files that cannot be used are bad input in every command."""
     try:
         return int(run(options))
     except OSError as fault:
@@ -281,9 +292,3 @@ def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) 
             raise
         what = f"{fault.filename}: {fault.strerror}" if fault.filename else str(fault.strerror)
         raise CommandError(2, f"{what}; {FILE_FAULTS[fault.errno]}") from fault
-    except Exception as fault:
-        from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
-
-        if isinstance(fault, KeyFileError | KeyNeededError):
-            raise CommandError(2, str(fault)) from fault
-        raise

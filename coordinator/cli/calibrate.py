@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 
 EXAMPLE = "petrobot calibrate --views board_images --simulated --output calibration.toml"
 ROOM = "petrobot.services.vision.calibrate"
@@ -43,7 +43,7 @@ def _take(options: argparse.Namespace) -> None:
             f"--simulated takes all the images, so --source {options.source} cannot be used with "
             "it; leave one out",
         )
-    try:
+    with file_of(folder, "give --views a folder that can be written"):
         if folder.exists() and any(folder.iterdir()):
             raise CommandError(
                 2,
@@ -51,7 +51,3 @@ def _take(options: argparse.Namespace) -> None:
                 "overwritten",
             )
         load_object(LABORATORY)([str(folder)])
-    except OSError as fault:
-        raise CommandError(
-            2, f"{folder}: {fault.strerror or fault}; give --views a folder that can be written"
-        ) from fault

@@ -166,52 +166,49 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run or resume the campaign; print and write its result. Return the exit code."""
+    from petrobot.coordinator.cli.forecast import compared, fitting
     from petrobot.coordinator.studies.campaign.conduct import Campaign, ProgressLine
-    from petrobot.coordinator.studies.campaign.plan import CampaignError, identity, read_manifest
+    from petrobot.coordinator.studies.campaign.plan import identity, read_manifest
     from petrobot.coordinator.studies.campaign.table import held, write_parquet
+    from petrobot.coordinator.studies.forecast.registered import read
 
     shown = ProgressLine(sys.stderr)
     shown.wanted = shown.wanted and not options.quiet
-    try:
-        if options.resume is not None:
-            why = "a campaign is continued as it began; leave this out beside --resume, or begin"
-            refuse_idle(options, f"{why} another one with --out", heeded=HEEDED)
-            folder, plan = options.resume, read_manifest(options.resume)
-        elif options.task is None:
-            raise CommandError(2, "give a TASK, or --resume FOLDER")
-        else:
-            if options.cluster:
-                why = "the workers are those of --cluster; leave this out"
-                refuse_idle(options, why, idle={"workers"})
-            task = load_task(options.task)
-            options.services = cell_path(options.services, options.task, task)
-            _refuse_unfit(task, options)
-            plan = _plan(options, task)
-            folder = (
-                options.out
-                or Path("campaigns")
-                / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
+    if options.resume is not None:
+        why = "a campaign is continued as it began; leave this out beside --resume, or begin"
+        refuse_idle(options, f"{why} another one with --out", heeded=HEEDED)
+        folder, plan = options.resume, read_manifest(options.resume)
+    elif options.task is None:
+        raise CommandError(2, "give a TASK, or --resume FOLDER")
+    else:
+        if options.cluster:
+            why = "the workers are those of --cluster; leave this out"
+            refuse_idle(options, why, idle={"workers"})
+        task = load_task(options.task)
+        options.services = cell_path(options.services, options.task, task)
+        _refuse_unfit(task, options)
+        plan = _plan(options, task)
+        folder = (
+            options.out
+            or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
+        )
+    if options.check is not None:
+        # Before the work, not after it
+        fitting(options.check, read(options.check), plan)
+    campaign = Campaign(folder, plan, shown)
+    with _written(folder), held(folder):
+        if campaign.complete and options.json != "-":
+            print(
+                f"nothing left to do: {folder} holds all runs; remove it, or give "
+                "another --out, to run them again"
             )
-        if options.check is not None:
-            _refuse_misfit(
-                options.check, plan
-            )  # report a forecast that does not fit before the work, not after it
-        campaign = Campaign(folder, plan, shown)
-        with _written(folder), held(folder):
-            if campaign.complete and options.json != "-":
-                print(
-                    f"nothing left to do: {folder} holds all runs; remove it, or give "
-                    "another --out, to run them again"
-                )
-            try:
-                asyncio.run(_conduct(campaign, options))
-            finally:
-                shown.close()
-            result = campaign.result()
-            write_parquet(folder)
-        check = None if options.check is None else _checked(options.check, folder)
-    except CampaignError as fault:
-        raise CommandError(2, str(fault)) from fault
+        try:
+            asyncio.run(_conduct(campaign, options))
+        finally:
+            shown.close()
+        result = campaign.result()
+        write_parquet(folder)
+    check = None if options.check is None else compared(options.check, folder)
     write_json(str(folder / "result.json"), result, "--out a folder")
     if options.json:
         write_json(options.json, result if check is None else {**result, "check": check})
@@ -233,27 +230,6 @@ def _written(folder: Path) -> Iterator[None]:
             f"space, and resume with --resume {folder}"
         )
         raise CommandError(2, text) from fault
-
-
-def _refuse_misfit(forecast: Path, plan: CampaignPlan) -> None:
-    from petrobot.coordinator.cli.forecast import fitting
-    from petrobot.coordinator.studies.forecast.history import ForecastError
-    from petrobot.coordinator.studies.forecast.registered import read
-
-    try:
-        fitting(forecast, read(forecast), plan)
-    except ForecastError as fault:
-        raise CommandError(2, str(fault)) from fault
-
-
-def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
-    from petrobot.coordinator.cli.forecast import compared
-    from petrobot.coordinator.studies.forecast.history import ForecastError
-
-    try:
-        return compared(forecast, folder)
-    except ForecastError as fault:
-        raise CommandError(2, str(fault)) from fault
 
 
 def _print_check(check: dict[str, Any] | None) -> None:

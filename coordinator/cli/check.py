@@ -37,6 +37,7 @@ from petrobot.coordinator.operator.task_check import (
     read_task,
 )
 from petrobot.coordinator.task.wording import Severity, listed, wrapped
+from petrobot.services.host.toml_text import InputError
 
 if TYPE_CHECKING:
     from petrobot.coordinator.analysis.may_run import MayRun
@@ -70,14 +71,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check the task. Return 0 if it may run, 2 if it may not, 3 if only a node that it needs is
     missing."""
-    from petrobot.coordinator.task.file import TaskFileError
     from petrobot.coordinator.task.file.reading import read_text
 
     path = task_path(options.task)
-    try:
-        text = read_text(path)
-    except TaskFileError as fault:
-        raise CommandError(2, str(fault)) from fault
+    text = read_text(path)
     task, services = read_task(text, str(path)), None
     cell: FaultyFile[Directory] = FaultyFile("")
     code: Mapping[str, Facts] = {}
@@ -87,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
             services = cell_path(services, options.task, task.value)
         if services is not None and services != path:
             cell, code = _read_cell(services)
-    except CommandError as fault:
+    except InputError as fault:
         cell.faults.append(str(fault))
     with told_if_slow("searching the states of the task (Ctrl-C: what is known by now)"):
         found = judge(task, text, cell, code, search=True)

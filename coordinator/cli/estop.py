@@ -29,6 +29,7 @@ from petrobot.coordinator.operator.run_address import RunAddress, find_address
 from petrobot.coordinator.run.folder import RESULT, NoRunError, journal_of
 from petrobot.coordinator.run.journal import JournalError, read_header
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.host.toml_text import InputError
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.emergency_stop import Stopped
@@ -76,10 +77,10 @@ def run(options: argparse.Namespace) -> int:
             lambda: _cells(options, path, address),
             lambda: (_in_time(lambda: load_directory(path), _hangs), None),
         )
-    except CommandError as fault:
+    except InputError as fault:
         if options.clear:
             raise
-        raise CommandError(fault.code, f"{fault}\nNOTHING WAS STOPPED: {HARDWARE}") from fault
+        raise CommandError(fault.exit_code, f"{fault}\nNOTHING WAS STOPPED: {HARDWARE}") from fault
     # The devices of the demo are stopped, too: who presses the button must not wait for this.
     tell_of_demo(path, directory, f", or {HARDWARE}")
     verb = CLEAR if options.clear else STOP
@@ -132,9 +133,9 @@ def _address(options: argparse.Namespace) -> RunAddress | None:
     notified."""
     try:
         return find_address(options.run, options.journal)
-    except NoRunError as fault:
+    except NoRunError:
         if options.run is not None:
-            raise CommandError(2, str(fault)) from fault
+            raise
         return None
 
 
@@ -155,7 +156,7 @@ def _cells(
     own = begun is not None and begun.source.resolve() == services_path(path).resolve()
     try:
         directory = load_directory(path)
-    except CommandError as fault:
+    except InputError as fault:
         if begun is None or not own:
             raise
         print(f"{fault}\nmeant is the cell as the newest run here began with it", file=sys.stderr)

@@ -62,9 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Make the film, and print where it is."""
-    from petrobot.coordinator.learning.estimates_file import EstimatesError
-    from petrobot.coordinator.studies.report.film import NoFilmError, images, refuse_file, write
-    from petrobot.coordinator.studies.report.raster import RasterError
+    from petrobot.coordinator.studies.report.film import images, refuse_file, write
 
     if options.out.suffix.lower() != ".webp":
         why = "only a .webp film has a quality; leave it out, or name the film .webp"
@@ -74,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
         refuse_file(options.out)
         made = list(images(recorded(options.run), **span, fps=options.fps, width=options.width))
         write(options.out, made, options.fps, options.quality)
-    except (NoFilmError, RasterError, EstimatesError, ValueError) as fault:
+    except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
     size = options.out.stat().st_size
     print(f"{options.out}: {len(made)} images, {size / 1e6:.2f} MB")

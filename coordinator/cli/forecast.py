@@ -134,30 +134,23 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Forecast, or compare: exit code 1 when the forecast is doubtful or disagrees."""
-    from petrobot.coordinator.analysis.formats.netfile import NetFileError
-    from petrobot.coordinator.studies.campaign.plan import CampaignError
-    from petrobot.coordinator.studies.forecast.history import ForecastError
-
-    try:
-        if options.compare is not None:
-            why = "a registered forecast is compared as it is; leave this out beside --compare"
-            refuse_idle(options, why, heeded={"compare", "markdown", "json"})
-            registered, folder = options.compare
-            return _compare(registered, folder, options)
-        if options.task is None or options.estimates is None:
-            raise CommandError(
-                2,
-                "give TASK and --estimates CAMPAIGN to forecast (`petrobot campaign TASK --out "
-                "CAMPAIGN` measures one), or --compare FORECAST CAMPAIGN",
-            )
-        why = "a forecast has no table; give it beside --compare"
-        refuse_idle(options, why, idle={"markdown"})
-        if options.out is None:
-            why = "nothing is registered without --out FILE; add that, or leave this out"
-            refuse_idle(options, why, idle={"doubtful"})
-        return _forecast(options)
-    except (ForecastError, CampaignError, NetFileError) as fault:
-        raise CommandError(2, str(fault)) from fault
+    if options.compare is not None:
+        why = "a registered forecast is compared as it is; leave this out beside --compare"
+        refuse_idle(options, why, heeded={"compare", "markdown", "json"})
+        registered, folder = options.compare
+        return _compare(registered, folder, options)
+    if options.task is None or options.estimates is None:
+        raise CommandError(
+            2,
+            "give TASK and --estimates CAMPAIGN to forecast (`petrobot campaign TASK --out "
+            "CAMPAIGN` measures one), or --compare FORECAST CAMPAIGN",
+        )
+    why = "a forecast has no table; give it beside --compare"
+    refuse_idle(options, why, idle={"markdown"})
+    if options.out is None:
+        why = "nothing is registered without --out FILE; add that, or leave this out"
+        refuse_idle(options, why, idle={"doubtful"})
+    return _forecast(options)
 
 
 def _forecast(options: argparse.Namespace) -> int:

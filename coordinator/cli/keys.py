@@ -54,12 +54,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _shared_key(directory: Directory, file: Path) -> str:
-    from petrobot.services.comm.protocol.security import KeyFileError, new_key, write_key
+    from petrobot.services.comm.protocol.security import new_key, write_key
 
-    try:
-        write_key(file, new_key())
-    except KeyFileError as fault:
-        raise CommandError(2, str(fault)) from fault
+    write_key(file, new_key())
     hosts = ", ".join(sorted({node.host for node in directory.nodes.values()}))
     return (
         f"wrote {file}: only you can read it; it is never printed or logged\n"
@@ -91,11 +88,7 @@ def _instead(directory: Directory, kind: str, new: str) -> str:
 
 def _certificates(directory: Directory, folder: Path) -> str:
     try:
-        from petrobot.services.comm.tls.certificates import (
-            CA_KEY,
-            CertificateError,
-            make_certificates,
-        )
+        from petrobot.services.comm.tls.certificates import CA_KEY, make_certificates
     except ImportError as fault:
         text = (
             "making certificates needs the package cryptography: pip install "
@@ -104,10 +97,7 @@ def _certificates(directory: Directory, folder: Path) -> str:
         raise CommandError(2, text) from fault
     from petrobot.services.comm.tls.credentials import CA_FILE
 
-    try:
-        written = make_certificates(folder, [COORDINATOR, *directory.nodes])
-    except CertificateError as fault:
-        raise CommandError(2, str(fault)) from fault
+    written = make_certificates(folder, [COORDINATOR, *directory.nodes])
     by_host: dict[str, list[str]] = {}
     for node in directory.nodes.values():
         by_host.setdefault(node.host, []).append(node.name)

@@ -263,34 +263,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Do what was asked for, and return the exit code."""
-    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, said
+    from petrobot.coordinator.learning.estimates_file import EstimatesFile, said
 
     why = f"learned {options.verb} makes no use of it; leave it out"
     refuse_idle(options, why, heeded=HEEDED[options.verb])
     file = EstimatesFile(options.file)
-    try:
-        if options.verb == "merge":
-            return _merge(file, options)
-        file = EstimatesFile(estimates_path(options.file))
-        kept = file.read(options.plant)
-        if options.plant is not None and options.plant not in kept.plants:
-            known = ", ".join(sorted(map(said, kept.plants))) or "none"
-            raise CommandError(
-                2, f"{options.file}: --plant {options.plant}: expected one of: {known}"
-            )
-        if options.verb == "task":
-            refuse_unknown_context(kept, _tasks(kept), options)
-            return show_task(kept, options)
-        _refuse_unknown(kept, options)
-        if options.verb == "show":
-            return show(kept, options.more or _tasks(kept), options)
-        if options.verb == "reset":
-            for task in options.more or [None]:
-                file.reset(task, selectors_only=options.selectors, plant=options.plant)
-        else:
-            _freeze(file, kept, options)
-    except EstimatesError as fault:
-        raise CommandError(2, str(fault)) from fault
+    if options.verb == "merge":
+        return _merge(file, options)
+    file = EstimatesFile(estimates_path(options.file))
+    kept = file.read(options.plant)
+    if options.plant is not None and options.plant not in kept.plants:
+        known = ", ".join(sorted(map(said, kept.plants))) or "none"
+        raise CommandError(2, f"{options.file}: --plant {options.plant}: expected one of: {known}")
+    if options.verb == "task":
+        refuse_unknown_context(kept, _tasks(kept), options)
+        return show_task(kept, options)
+    _refuse_unknown(kept, options)
+    if options.verb == "show":
+        return show(kept, options.more or _tasks(kept), options)
+    if options.verb == "reset":
+        for task in options.more or [None]:
+            file.reset(task, selectors_only=options.selectors, plant=options.plant)
+    else:
+        _freeze(file, kept, options)
     print(f"{options.file}: {options.verb} {', '.join(options.more) or 'everything'}: done")
     return 0
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.operator.task_check import cell_of
 from petrobot.services.host.command_line import LARGEST_SEED, whole
 from petrobot.services.host.json_text import json_text
@@ -103,15 +103,11 @@ def measurements(file: Path | None) -> Callable[[Task, Cell | None], Measured] |
     if file is None:
         return None
     from petrobot.coordinator.analysis.may_run import devices_of
-    from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+    from petrobot.coordinator.learning.estimates_file import EstimatesFile
     from petrobot.coordinator.learning.propagation import measured_from
 
     file = estimates_path(file)
-    try:
-        kept = EstimatesFile(file).read()
-    except EstimatesError as fault:
-        raise CommandError(2, str(fault)) from fault
-
+    kept = EstimatesFile(file).read()
     others = [p or UNKNOWN for p, found in kept.plants.items() if found.tallies and p != kept.plant]
     if others:
         print(
@@ -190,15 +186,13 @@ def own_tasks(directory: Directory) -> Path:
 
 def load_task(name: str) -> Task:
     """Read a task file."""
-    from petrobot.coordinator.task.file import TaskFileError, load
+    from petrobot.coordinator.task.file import load
 
     path = task_path(name)
     try:
         return load(path)
     except OSError as fault:
         raise CommandError(2, f"{path}: {fault.strerror or fault}") from fault
-    except TaskFileError as fault:
-        raise CommandError(2, str(fault)) from fault
 
 
 def services_path(given: Path | None) -> Path:
@@ -327,18 +321,11 @@ def file_line(path: Path, key: str) -> str:
 def load_directory(given: Path | None, dry_run: bool = False) -> Directory:
     """Read services.toml; with `dry_run` all drives of this host are to stay off, and a driver that
     cannot do without them is refused."""
-    from petrobot.services.comm.location_file import DirectoryError, load
+    from petrobot.services.comm.location_file import load
 
     path = services_path(given)
-    try:
+    with file_of(path, "give --services a location file that can be read"):
         directory = load(path, dry_run)
-    except OSError as fault:
-        text = (
-            f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
-        )
-        raise CommandError(2, text) from fault
-    except DirectoryError as fault:
-        raise CommandError(2, str(fault)) from fault
     if dry_run:
         from petrobot.services.comm.location_file import read_text
         from petrobot.services.comm.location_file.code import code_faults, read_code
@@ -407,12 +394,9 @@ def refuse_arguments(
 
 def refuse_script(mock: Path | None, directory: Directory, task: Task | None = None) -> None:
     """Refuse a file of scripted actions that cannot be used with this cell, or this task."""
-    from petrobot.coordinator.launch import RequestError, scripted_actions
+    from petrobot.coordinator.launch import scripted_actions
 
-    try:
-        scripted_actions(mock, directory, task)
-    except RequestError as fault:
-        raise CommandError(2, str(fault)) from fault
+    scripted_actions(mock, directory, task)
 
 
 def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
@@ -437,10 +421,6 @@ def write_json(path: str, data: Any, give: str = "--json a file") -> None:
     if path == "-":
         print(text, end="")
         return
-    try:
+    with file_of(path, f"give {give} that can be written"):
         make_folder(Path(path).parent)
         write_whole(Path(path), text)
-    except OSError as fault:
-        raise CommandError(
-            2, f"{path}: {fault.strerror or fault}; give {give} that can be written"
-        ) from fault

@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
 from petrobot.coordinator.cli.options import recorded, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
 from petrobot.services.host.json_text import without_controls
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -53,8 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print or export."""
-    from petrobot.coordinator.run.journal import JournalError
-    from petrobot.coordinator.run.recording import ReplayError
 
     if (log := _node_log(options)) is not None:
         why = "the log of a node is text; leave it out"
@@ -67,22 +66,12 @@ def run(options: argparse.Namespace) -> int:
     if options.mcap is not None:
         why = "--mcap names the file and the format; leave this out"
         refuse_idle(options, why, idle={"format", "out"})
-    try:
+    with file_of(options.mcap or options.out, "name a file that can be written"):
         if options.mcap is not None:
             _write_mcap(options.mcap, found)
-            return 0
-        _write(
-            options.out,
-            _text(found) if options.format == "text" else _exported(options.format, found),
-        )
-    except (JournalError, ReplayError) as fault:
-        raise CommandError(2, str(fault)) from fault
-    except OSError as fault:
-        text = (
-            f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that "
-            "can be written"
-        )
-        raise CommandError(2, text) from fault
+        else:
+            text = options.format == "text"
+            _write(options.out, _text(found) if text else _exported(options.format, found))
     return 0
 
 
@@ -95,7 +84,7 @@ def _node_log(options: argparse.Namespace) -> Path | None:
         return None
     try:
         directory = load_directory(options.services)
-    except CommandError:
+    except InputError:
         if options.services is not None:
             raise
         return None  # the error to report is that there is no such run, not a broken location file
@@ -124,12 +113,9 @@ def _node_lines(log: Path) -> Iterator[str]:
 
 
 def _write_mcap(path: Path, found: Recorded) -> None:
-    from petrobot.coordinator.run.export import McapMissingError, write_mcap
+    from petrobot.coordinator.run.export import write_mcap
 
-    try:
-        count = write_mcap(path, found.journal, found.engine.compiled.net, found.steps())
-    except McapMissingError as fault:
-        raise CommandError(2, str(fault)) from fault
+    count = write_mcap(path, found.journal, found.engine.compiled.net, found.steps())
     print(f"{path}: {count} messages")
 
 

@@ -53,23 +53,19 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 async def connected(
     options: argparse.Namespace,
 ) -> AsyncIterator[tuple[RunAddress, OperatorClient]]:
-    """Connect to the run that the options name. Raises CommandError: 2 if there is none, 3 if it
+    """Connect to the run that the options name. Raises NoRunError, and CommandError (3) if it
     cannot be reached."""
     from petrobot.coordinator.operator.client import OperatorError
     from petrobot.coordinator.operator.run_address import find_address, waiting
-    from petrobot.coordinator.run.folder import NoRunError
 
+    address = find_address(options.run, options.journal)
     try:
-        address = find_address(options.run, options.journal)
-        try:
-            async with connect(address, options.name) as client:
-                yield address, client
-        except OperatorError as fault:
-            if address.run in waiting(options.journal):  # its coordinator has died meanwhile
-                find_address(address.run, options.journal)
-            raise CommandError(3, f"{address.run}: {fault}") from fault
-    except NoRunError as fault:
-        raise CommandError(2, str(fault)) from fault
+        async with connect(address, options.name) as client:
+            yield address, client
+    except OperatorError as fault:
+        if address.run in waiting(options.journal):  # its coordinator has died meanwhile
+            find_address(address.run, options.journal)
+        raise CommandError(3, f"{address.run}: {fault}") from fault
 
 
 def connect(address: RunAddress, name: str | None) -> OperatorClient:

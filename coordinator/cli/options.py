@@ -203,16 +203,11 @@ def tidy(options: argparse.Namespace, folder: Path | None) -> None:
 
 def recorded(name: str) -> Recorded:
     """Read the run of this id, folder or `last`, with its task, cell and engine. Raises
-    CommandError."""
+    InputError."""
     from petrobot.coordinator.operator.start_from import read_recorded
-    from petrobot.coordinator.run.folder import NoRunError, journal_of
-    from petrobot.coordinator.run.journal import JournalError
-    from petrobot.coordinator.task.file import TaskFileError
-    from petrobot.services.comm.location_file import DirectoryError
+    from petrobot.coordinator.run.folder import journal_of
 
     try:
         return read_recorded(journal_of(name))
-    except (NoRunError, JournalError, TaskFileError, DirectoryError) as fault:
-        raise CommandError(2, str(fault)) from fault
     except (KeyError, OSError) as fault:
         raise CommandError(2, f"{name}: {fault}") from fault

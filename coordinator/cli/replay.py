@@ -20,7 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Replay. Return 0 if everything is the same, 1 if there is a difference."""
-    from petrobot.coordinator.run.journal import JournalError
     from petrobot.coordinator.run.recording import ReplayError
 
     found = recorded(options.run)
@@ -28,8 +27,6 @@ def run(options: argparse.Namespace) -> int:
     try:
         for step in found.steps():
             count, firings = count + 1, step.state.firings
-    except JournalError as fault:
-        raise CommandError(2, str(fault)) from fault
     except ReplayError as fault:
         raise CommandError(1, str(fault)) from fault
     torn = found.journal.torn_bytes

@@ -11,16 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import add_json_argument, load_task, pictures_of, write_json
 from petrobot.coordinator.cli.options import refuse_idle
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from petrobot.coordinator.operator.start_from import Recorded
-    from petrobot.coordinator.run.recording import RecordedStep
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.studies.campaign.table import TrialRow
     from petrobot.coordinator.studies.report.run_page import ObservedRun
@@ -62,21 +59,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the page and its pictures."""
-    from petrobot.coordinator.studies.campaign.plan import MANIFEST, CampaignError
+    from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
     folder = Path(options.subject)
     if options.against is None:
         why = "it is of a comparison; add --against CAMPAIGN, or leave it out"
         refuse_idle(options, why, idle={"rho_of", "json"})
-    try:
-        if (folder / MANIFEST).exists():
-            page, pictures, target = _campaign(folder, options)
-        elif options.against is not None:
-            raise CommandError(2, f"{folder} is not a campaign: --against compares two campaigns")
-        else:
-            page, pictures, target = _run(options.subject)
-    except CampaignError as fault:
-        raise CommandError(2, str(fault)) from fault
+    if (folder / MANIFEST).exists():
+        page, pictures, target = _campaign(folder, options)
+    elif options.against is not None:
+        raise CommandError(2, f"{folder} is not a campaign: --against compares two campaigns")
+    else:
+        page, pictures, target = _run(options.subject)
     out = options.out or target
     out = out if out.suffix else out.with_suffix(".html")
     _write(out, page, pictures, quiet=options.json == "-")
@@ -89,15 +83,11 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
 
     beside = page.with_name(f"{page.stem}_pictures")
     missing = unavailable()
-    try:
+    with file_of(page, "give --out a file that can be written"):
         make_folder(beside)
         write_whole(page, html)
         for name, svg in pictures.items():
             _draw(beside / name, standalone(svg), raster=not missing)
-    except OSError as fault:
-        raise CommandError(
-            2, f"{page}: {fault.strerror or fault}; give --out a file that can be written"
-        ) from fault
     if not quiet:
         print(f"report: {page}")
         print(f"pictures: {beside} ({len(pictures)} as SVG{'' if missing else ' and PNG'})")
@@ -203,7 +193,7 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
 
     found = recorded(name)
     timeline, observed = Timeline(origin=0.0), _observer(found)  # the journal's clock
-    for step in _steps(found):
+    for step in found.steps():
         timeline.stimulus(step.time, step.stimulus)
         for instruction in step.instructions:
             timeline.instruction(step.time, instruction)
@@ -247,16 +237,6 @@ def _observer(found: Recorded) -> ObservedRun:
         print(f"no learned probabilities: {fault}", file=sys.stderr)
         session = None
     return ObservedRun(found.task, None if session is None else session.selector)
-
-
-def _steps(found: Recorded) -> Iterator[RecordedStep]:
-    from petrobot.coordinator.run.journal import JournalError
-    from petrobot.coordinator.run.recording import ReplayError
-
-    try:
-        yield from found.steps()
-    except (JournalError, ReplayError) as fault:
-        raise CommandError(2, str(fault)) from fault
 
 
 def _result_of(path: Path, task: Task) -> dict[str, Any]:

@@ -307,13 +307,10 @@ def conduct(
     from petrobot.coordinator.operator.session import interruptible
     from petrobot.coordinator.operator.start_from import DepartureError
     from petrobot.coordinator.run.journal import JournalError
-    from petrobot.coordinator.run.mission import UNSCORED, MissionError
-    from petrobot.coordinator.run.realtime import UnreachableError
+    from petrobot.coordinator.run.mission import UNSCORED
     from petrobot.coordinator.run.recording import JournalStore, ReplayError
-    from petrobot.coordinator.run.supervisor import LaunchError
     from petrobot.coordinator.run.timeline import Timeline
     from petrobot.services.comm.location_file import DirectoryError
-    from petrobot.services.comm.lockstep.cell import CellError
 
     made: list[RunSession] = []
     timeline = None if options.report is None else Timeline()  # it grows with the run
@@ -335,10 +332,6 @@ def conduct(
             up = " --up" * options.up
             print(f"`petrobot resume {folder}{up}` continues this run", file=sys.stderr)
         raise
-    except MissionError as fault:
-        raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
-    except (CellError, UnreachableError, LaunchError) as fault:
-        raise CommandError(3, str(fault)) from fault
     except JournalError as fault:
         if not made:
             raise CommandError(2, str(fault)) from fault

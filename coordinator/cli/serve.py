@@ -93,28 +93,24 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     from petrobot.coordinator.page.task_store import TaskStore
     from petrobot.coordinator.run.folder import DEFAULT
     from petrobot.coordinator.run.realtime import credentials_of
-    from petrobot.coordinator.run.supervisor import LaunchError
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     credentials_of(directory)  # report unusable keys before anything is started
     runs = options.journal or DEFAULT
-    try:
-        async with AsyncExitStack() as nodes:
-            own = local_nodes(directory, runs / "logs", mock=options.mock) if options.up else None
-            if own and not await done_before(stop, nodes.enter_async_context(own)):
-                return 0
-            station = Station(
-                directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates
-            )
-            try:
-                await station.look()
-                await _page(station, runs, options, stop)
-            finally:
-                await station.close()
-    except LaunchError as fault:
-        raise CommandError(3, str(fault)) from fault
+    async with AsyncExitStack() as nodes:
+        own = local_nodes(directory, runs / "logs", mock=options.mock) if options.up else None
+        if own and not await done_before(stop, nodes.enter_async_context(own)):
+            return 0
+        station = Station(
+            directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates
+        )
+        try:
+            await station.look()
+            await _page(station, runs, options, stop)
+        finally:
+            await station.close()
     return 0
 
 

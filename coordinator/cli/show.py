@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import (
     add_estimates_argument,
     add_services_argument,
@@ -80,11 +80,8 @@ def run(options: argparse.Namespace) -> int:
     if options.out == "-":
         print(svg)
         return 0
-    try:
+    with file_of(out, "give --out a file that can be written"):
         write_whole(out, _png(svg, out) if out.suffix == ".png" else svg)
-    except OSError as fault:
-        text = f"{out}: {fault.strerror or fault}; give --out a file that can be written"
-        raise CommandError(2, text) from fault
     return 0
 
 

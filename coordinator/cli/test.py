@@ -16,7 +16,7 @@ from typing import Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
-from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.location_file import Directory
 from petrobot.services.host.command_line import number
 
 ANSWERS_WITHIN = 1.0
@@ -130,8 +130,6 @@ def run(options: argparse.Namespace) -> int:
             positions=options.positions,
             progress=_progress(),
         )
-    except DirectoryError as fault:  # it names the device itself
-        raise CommandError(2, str(fault)) from fault
     except (ValueError, OSError) as fault:
         raise CommandError(2, f"{directory.source}: devices.{options.device}: {fault}") from fault
     for text in (*found.faults, *found.notes, *found.busy):

@@ -133,7 +133,7 @@ def unit(directory: Directory, logs: Path) -> str:
 
 async def _up(directory: Directory, options: argparse.Namespace) -> int:
     from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.run.supervisor import LaunchError, Supervisor
+    from petrobot.coordinator.run.supervisor import Supervisor
 
     programs = local_programs(
         directory,
@@ -151,18 +151,15 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
         options.no_respawn or options.lockstep
     )  # a member of a lock-step cell that died cannot join it again
     supervisor = Supervisor(programs, options.logs, respawn=respawn)
-    try:
-        async with AsyncExitStack() as nodes:
-            if not await done_before(stop, nodes.enter_async_context(supervisor)):
-                return 0
-            for name, process in supervisor.process_ids().items():
-                node = directory.nodes[name]
-                print(f"{name:12} ready on {node.host}:{node.port} (process {process})", flush=True)
-            print("Ctrl-C stops them all", flush=True)
-            # Members of a lock-step cell end by themselves.
-            await done_before(stop, supervisor.ended() if options.lockstep else stop.wait())
-    except LaunchError as fault:
-        raise CommandError(3, str(fault)) from fault
+    async with AsyncExitStack() as nodes:
+        if not await done_before(stop, nodes.enter_async_context(supervisor)):
+            return 0
+        for name, process in supervisor.process_ids().items():
+            node = directory.nodes[name]
+            print(f"{name:12} ready on {node.host}:{node.port} (process {process})", flush=True)
+        print("Ctrl-C stops them all", flush=True)
+        # Members of a lock-step cell end by themselves.
+        await done_before(stop, supervisor.ended() if options.lockstep else stop.wait())
     return 0
 
 

@@ -18,19 +18,17 @@ from petrobot.coordinator.drawing.routing import (
 )
 from petrobot.coordinator.drawing.scene import (
     RADIUS,
-    Blocks,
-    Caption,
+    Blocks as Blocks,
+    Caption as Caption,
     DrawnNode,
-    Overlay,
+    Overlay as Overlay,
     Scene,
-    expanded,
+    expanded as expanded,
     scene_of_net,
     scene_of_task,
 )
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.net import Marking, Net
-
-__all__ = ["Blocks", "Caption", "Overlay", "draw", "expanded"]
 
 
 def draw(

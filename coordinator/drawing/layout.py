@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from itertools import pairwise
@@ -268,6 +268,13 @@ class NodePositions:
     at: Mapping[str, Point]
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
 
+    def under(self, move: Callable[[Point], Point]) -> NodePositions:
+        """Return the positions with every point moved."""
+        return NodePositions(
+            {name: move(point) for name, point in self.at.items()},
+            {edge: [move(point) for point in way] for edge, way in self.through.items()},
+        )
+
 
 def lay_out(
     wanted: Mapping[str, Point | None],
@@ -381,10 +388,7 @@ def _moved(block: NodePositions, corner: Point) -> NodePositions:
     def to(point: Point) -> Point:
         return corner[0] + _WIDER * (point[0] - left), corner[1] + point[1] - top
 
-    return NodePositions(
-        {name: to(point) for name, point in block.at.items()},
-        {edge: [to(point) for point in way] for edge, way in block.through.items()},
-    )
+    return block.under(to)
 
 
 def _fill_in(
@@ -449,10 +453,7 @@ def _folded(flat: NodePositions, columns: int) -> NodePositions:
         column = round((point[0] - MARGIN) / COLUMN) - b * per
         return MARGIN + (per - 1 - column if b % 2 else column) * COLUMN, point[1] + tops[b]
 
-    return NodePositions(
-        {name: at(point) for name, point in flat.at.items()},
-        {edge: [at(point) for point in way] for edge, way in flat.through.items()},
-    )
+    return flat.under(at)
 
 
 def _layered(layers: Layers, names: Sequence[str], edges: Sequence[Edge]) -> NodePositions:

@@ -476,11 +476,7 @@ def _more(counts: Mapping[Any, int], key: Any, by: int = 1) -> dict[Any, int]:
     n = counts.get(key, 0) + by
     if n < 0:
         raise KeyError(f"no run was counted as {key}")
-    return _put(counts, key, n) if n else _without(counts, key)
-
-
-def _without(counts: Mapping[Any, int], key: Any) -> dict[Any, int]:
-    return {k: v for k, v in counts.items() if k != key}
+    return _put(counts, key, n) if n else {k: v for k, v in counts.items() if k != key}
 
 
 def _put(entries: Mapping[Any, Any], key: Any, value: Any) -> dict[Any, Any]:

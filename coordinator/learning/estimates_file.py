@@ -70,6 +70,7 @@ from petrobot.services.comm.location_file import (
     SIMULATED,
     same_physics,
 )
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
@@ -91,7 +92,7 @@ MACHINE_ID = Path("/etc/machine-id")
 apart."""
 
 
-class EstimatesError(Exception):
+class EstimatesError(InputError):
     """The estimates file cannot be used; the text names the file, what is wrong and what to do."""
 
 

@@ -44,8 +44,12 @@ from petrobot.coordinator.learning.trial_tokens import NOBODY, TrialTokens
 from petrobot.coordinator.learning.waits import EventWaits
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Executed, Status, Task
-from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
-from petrobot.coordinator.task.conditions import parse as parse_condition
+from petrobot.coordinator.task.conditions import (
+    ConditionError,
+    ConditionFault,
+    Expression,
+    parse as parse_condition,
+)
 from petrobot.services.comm.protocol.messages import Feedback
 
 LARGEST = 1e150
@@ -425,8 +429,8 @@ class LearningSelector(FirstAlternative):
         measure = {p: self.learning.question(p).measure for p in self.learning.task.primitive_tasks}
         if self._declared is not None:  # in lock step no measured time may influence a choice
             runs = [
-                (name, action, context, end if measure[name] == "cpu" else _without_cpu(end))
-                for name, action, context, end in runs
+                (p, action, c, end if measure[p] == "cpu" else replace(end, cpu_seconds=None))
+                for p, action, c, end in runs
             ]
         for verdict in verdicts_of_task(runs, bool(trial.met), trial.seconds, measure.__getitem__):
             self._note(replace(verdict, beside=()) if late else verdict)
@@ -455,10 +459,6 @@ class LearningSelector(FirstAlternative):
             self._replace(end.outcome, corrected.status)
             what = (end.primitive_task, end.action, end.context, end.outcome)
             self._note(Correction(*what, corrected.status, corrected.cause))
-
-
-def _without_cpu(end: Observation) -> Observation:
-    return replace(end, cpu_seconds=None)
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:

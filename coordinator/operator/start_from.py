@@ -34,6 +34,7 @@ from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
 from petrobot.coordinator.run.recording import STIMULUS, RecordedStep, replay
 from petrobot.coordinator.task import Kind, Status, Task
 from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.host.toml_text import InputError
 
 AGAIN = "again"
 """An active run starts again."""
@@ -83,7 +84,7 @@ def read_recorded(path: Path) -> Recorded:
     return Recorded(journal, task, directory, Engine(task, devices))
 
 
-class DepartureError(ValueError):
+class DepartureError(InputError, ValueError):
     """No run can start there: which record or word is wrong, and what is possible."""
 
 

@@ -53,7 +53,7 @@ async def _revision(request: web.Request) -> web.Response:
             {"revision": request.app[PAGE_STATE].store.read(request.match_info["name"]).revision}
         )
     except StoreError as fault:
-        raise refused(RefusedError(fault.status, str(fault))) from fault
+        raise refused(fault) from fault
 
 
 async def _save(request: web.Request) -> web.StreamResponse:

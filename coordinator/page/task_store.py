@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.page.edits import EditError, Rename, edited, parse
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -18,15 +19,8 @@ _TASK = re.compile(rb"^\s*(\[\s*task\s*[].]|task\s*(=\s*\{|\.))", re.MULTILINE)
 LARGEST_FILE = 1024 * 1024
 
 
-class StoreError(Exception):
-    """A task file cannot be read or written; `status` is the HTTP status to answer with."""
-
-    def __init__(self, status: int, text: str) -> None:
-        super().__init__(status, text)
-        self.status, self.text = status, text
-
-    def __str__(self) -> str:
-        return self.text
+class StoreError(RefusedError):
+    """A task file cannot be read or written."""
 
 
 class Conflict(Exception):  # noqa: N818 - not an error: two people edited the same file

@@ -19,7 +19,7 @@ from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.operator.task_check import judge_text
 from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
-from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
+from petrobot.coordinator.page.task_store import Conflict, TaskStore, TaskText
 from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.file import TaskFileError, dumps, loads
 
@@ -96,10 +96,6 @@ Fields = Mapping[str, Any] | None
 """Fields of a `Cell`; None: it is not known which actions are offered."""
 
 
-class FormatError(ValueError):
-    """A format is unknown, or the text is not in it."""
-
-
 @dataclass(frozen=True, slots=True)
 class ConvertedTask:
     """A task in another format."""
@@ -116,18 +112,18 @@ def findings(text: str, filename: str, cell: Fields, services: str = "") -> list
 
 
 def load(text: str, filename: str) -> Task:
-    """Return the task in a text. Raises FormatError with all faults."""
+    """Return the task in a text. Raises RefusedError with all faults."""
     try:
         return loads(text, filename)
     except TaskFileError as error:
-        raise FormatError(str(error)) from error
+        raise RefusedError(400, str(error)) from error
 
 
 def export(
     text: str, filename: str, form: str, cell: Fields, estimates: str = "", plant: str = ""
 ) -> ConvertedTask:
     """Return the task in another format; `gspn.svg` draws its stochastic view, with the numbers
-    that `newest_measured` finds. Raises FormatError."""
+    that `newest_measured` finds. Raises RefusedError."""
     task = load(text, filename)
     if form == "toml":
         return ConvertedTask(dumps(task), "application/toml")
@@ -147,25 +143,25 @@ def export(
             measured, source = newest_measured(estimates, task, devices, plant)
             view = stochastic_view(task, measured, devices=devices)
         except ValueError as fault:
-            raise FormatError(f"no stochastic view: {fault}") from fault
+            raise RefusedError(400, f"no stochastic view: {fault}") from fault
         legend = "; ".join(filter(None, (source, assumed(known))))
         return ConvertedTask(gspn_svg(view, f"Assumed: {legend}."), "image/svg+xml")
-    raise FormatError(f"no format {form!r}: toml, pnml and gspn.svg are known")
+    raise RefusedError(400, f"no format {form!r}: toml, pnml and gspn.svg are known")
 
 
 def imported(form: str, text: str) -> str:
-    """Return a net in another format as the text of a task file. Raises FormatError."""
+    """Return a net in another format as the text of a task file. Raises RefusedError."""
     if form == "toml":
         return text
     if form != "pnml":
-        raise FormatError(f"no format {form!r}: toml and pnml are known")
+        raise RefusedError(400, f"no format {form!r}: toml and pnml are known")
     from petrobot.coordinator.analysis.formats.netfile import NetFileError
     from petrobot.coordinator.analysis.formats.pnml import parse_pnml
 
     try:
         return as_task_file(parse_pnml(text))
     except NetFileError as error:
-        raise FormatError(f"not a place/transition net in PNML: {error}") from error
+        raise RefusedError(400, f"not a place/transition net in PNML: {error}") from error
 
 
 # --- as requests ------------------------------------------------------------------------------
@@ -173,10 +169,6 @@ def imported(form: str, text: str) -> str:
 
 def _store(tasks: str, shipped: str) -> TaskStore:
     return TaskStore(Path(tasks), Path(shipped) if shipped else None)
-
-
-def _refused(fault: StoreError) -> RefusedError:
-    return RefusedError(fault.status, str(fault))
 
 
 def _described(task: TaskText, cell: Fields) -> dict[str, Any]:
@@ -192,10 +184,7 @@ def _described(task: TaskText, cell: Fields) -> dict[str, Any]:
 
 
 def _open(tasks: str, shipped: str, name: str, cell: Fields) -> dict[str, Any]:
-    try:
-        return _described(_store(tasks, shipped).read(name), cell)
-    except StoreError as fault:
-        raise _refused(fault) from fault
+    return _described(_store(tasks, shipped).read(name), cell)
 
 
 def _save(
@@ -221,8 +210,6 @@ def _save(
             "theirs": _described(conflict.theirs, cell),
         }
         raise RefusedError(409, str(conflict), both) from conflict
-    except StoreError as fault:
-        raise _refused(fault) from fault
 
 
 def _drawn(
@@ -230,10 +217,7 @@ def _drawn(
 ) -> dict[str, Any]:
     """Return the text that a drawing would be saved as: {text}."""
     store = _store(tasks, shipped)
-    try:
-        return {"text": store.edited_text(store.current(name), document, _renames(renames))}
-    except StoreError as fault:
-        raise _refused(fault) from fault
+    return {"text": store.edited_text(store.current(name), document, _renames(renames))}
 
 
 def _check(cell: Fields, services: str, name: str, **drawing: Any) -> dict[str, Any]:
@@ -245,20 +229,15 @@ def _check(cell: Fields, services: str, name: str, **drawing: Any) -> dict[str, 
 def _export(
     tasks: str, shipped: str, name: str, form: str, cell: Fields, estimates: str, plant: str
 ) -> dict[str, Any]:
-    try:
-        task = _store(tasks, shipped).read(name)
-        made = export(task.text, f"{task.name}.toml", form, cell, estimates, plant)
-    except StoreError as fault:
-        raise _refused(fault) from fault
-    except FormatError as fault:
-        raise RefusedError(400, str(fault)) from fault
+    task = _store(tasks, shipped).read(name)
+    made = export(task.text, f"{task.name}.toml", form, cell, estimates, plant)
     return {"text": made.text, "content_type": made.content_type}
 
 
 def _import(form: str, text: str) -> dict[str, Any]:
     try:
         return {"document": plain(parse(imported(form, text)))}
-    except (FormatError, EditError) as fault:
+    except EditError as fault:
         raise RefusedError(400, str(fault)) from fault
 
 

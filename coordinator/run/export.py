@@ -24,6 +24,7 @@ from petrobot.coordinator.run.journal import Journal
 from petrobot.coordinator.run.recording import RecordedStep, Remark, TakeOver, with_asides
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.json_text import json_text, without_controls
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import write_whole
 
 
@@ -156,7 +157,7 @@ CHANNELS: Final[Mapping[str, Mapping[str, Any]]] = {
 """Topic `/petrobot/NAME`: properties of its messages."""
 
 
-class McapMissingError(Exception):
+class McapMissingError(InputError):
     """The package `mcap` is not installed; the text says how to get it."""
 
 

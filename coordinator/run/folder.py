@@ -14,6 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from petrobot.services.host.toml_text import InputError
+
 _INSTALLED = Path(__file__).parents[2]
 
 JOURNAL = "run.journal"
@@ -32,7 +34,7 @@ its own rules (`recording.as_recorded`).
 """
 
 
-class NoRunError(Exception):
+class NoRunError(InputError):
     """There is no such mission run; the text names those that exist."""
 
 

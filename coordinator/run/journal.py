@@ -32,6 +32,7 @@ from typing import Any
 import msgpack
 
 from petrobot.coordinator.run.folder import date_back
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import make_folder, sync_folder
 
 FORMAT = 1
@@ -43,7 +44,7 @@ SMALLEST_RECORD, LARGEST_RECORD = 4, 1 << 25
 _ARRAY_OF_THREE = 0x93
 
 
-class JournalError(Exception):
+class JournalError(InputError):
     """The journal cannot be read or written: file, place and remedy."""
 
 

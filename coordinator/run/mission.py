@@ -39,6 +39,7 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
     split_boot,
 )
+from petrobot.services.host.toml_text import InputError
 
 _log = logging.getLogger(__package__)
 MOST_TOLD = 20_000
@@ -67,12 +68,13 @@ class Stage(Enum):
     OVER = "over"
 
 
-class MissionError(Exception):
+class MissionError(InputError):
     """A mission run could not be prepared or scored; the text says what failed, and why."""
 
     def __init__(self, text: str, *, bad_input: bool = False) -> None:
         super().__init__(text)
         self.bad_input = bad_input
+        self.exit_code = 2 if bad_input else 1
 
 
 @dataclass(slots=True)
@@ -356,7 +358,8 @@ class Mission:
     def start(self, now: float) -> None:
         """Start, with all nodes connected: prepare the cell, or begin at once if there is nothing
         to prepare."""
-        if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
+        asked = {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
+        if not self._ask(now, "prepare", self.executor.task.prepare, asked):
             self._begin(now)
         else:
             self.stage = Stage.PREPARING
@@ -460,9 +463,6 @@ class Mission:
         return {**general, **self.score, **durations}
 
     # --- stages -------------------------------------------------------------------------------
-
-    def _preparation(self) -> dict[str, Any]:
-        return {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
 
     def _begin(self, now: float) -> None:
         self.stage, self.begun = Stage.RUNNING, now

@@ -31,6 +31,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.tls.credentials import Credentials, credentials
 from petrobot.services.host.emergency_latch import uptime
+from petrobot.services.host.toml_text import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -127,8 +128,10 @@ def on_disk(work: Callable[[], T]) -> asyncio.Future[T]:
     return done
 
 
-class UnreachableError(Exception):
+class UnreachableError(InputError):
     """Nodes cannot be reached; `nodes` names them."""
+
+    exit_code = 3
 
     def __init__(self, nodes: Sequence[str], text: str) -> None:
         super().__init__(nodes, text)

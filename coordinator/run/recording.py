@@ -33,6 +33,7 @@ from petrobot.coordinator.engine import (
 from petrobot.coordinator.engine.step import RECORDED
 from petrobot.coordinator.run.folder import SEMANTICS
 from petrobot.coordinator.run.journal import Journal, JournalError, JournalWriter
+from petrobot.services.host.toml_text import InputError
 
 _log = logging.getLogger(__name__)
 
@@ -163,7 +164,7 @@ class JournalStore:
         return not self.writer.pending
 
 
-class ReplayError(Exception):
+class ReplayError(InputError):
     """The engine does something else than the journal says: number of the record, and both."""
 
 

@@ -22,6 +22,7 @@ from typing import BinaryIO
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.realtime import on_disk
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import make_folder
 
 _log = logging.getLogger(__package__)
@@ -40,8 +41,10 @@ LAST_PART = 1 << 16  # of a log is searched for its last lines (bytes)
 STABLE_AFTER = 10.0  # after this uptime (s) a node starts again without a pause
 
 
-class LaunchError(Exception):
+class LaunchError(InputError):
     """A node did not start; the text says which, and what it printed."""
+
+    exit_code = 3
 
 
 @dataclass(frozen=True, slots=True)

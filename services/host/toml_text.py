@@ -19,6 +19,14 @@ LONGEST = 1_000
 """Most characters of a fault that are shown: the value in it may be a whole file."""
 
 
+class InputError(Exception):
+    """What the user gave cannot be used: the text says what, where, and the remedy. A command that
+    ends with it prints the text."""
+
+    exit_code = 2
+    """Exit code of that command."""
+
+
 class TomlError(ValueError):
     """A text that is not TOML: in which `line` (None: unknown), at which `key`, what was `found`,
     and the `remedy`."""

@@ -18,13 +18,12 @@ from typing import Any, Final
 
 from petrobot.services.device import LIMITS, Driver, Ports, Setpoint
 from petrobot.services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
-from petrobot.services.mobile.model import RoverModel as Numbers
-from petrobot.services.mobile.model import nominal_rover, read_rover
-from petrobot.services.mobile.odometry import Odometry, Pose, turned
+from petrobot.services.mobile.model import RoverModel as Numbers, nominal_rover, read_rover
+from petrobot.services.mobile.odometry import Odometry, Pose as Pose, turned
 from petrobot.services.mobile.reflectors import ReflectorMap, parse_echoes
-from petrobot.services.mobile.sight import TrackAhead, TrackEnd
+from petrobot.services.mobile.sight import TrackAhead, TrackEnd as TrackEnd
 from petrobot.services.mobile.track_map import Fit, TrackMap
-from petrobot.services.mobile.wheel_drives import MasterPhase, WheelMaster
+from petrobot.services.mobile.wheel_drives import MasterPhase as MasterPhase, WheelMaster
 
 LEASE: Final = 0.4
 """Seconds after which a motion ends unless its command is repeated."""
@@ -418,6 +417,3 @@ def _positive(body: Mapping[str, Any], key: str, default: float | None = None) -
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < 10.0:
         raise ValueError(f"{key}: expected a number above 0 and below 10, got {value!r}")
     return float(value)
-
-
-__all__ = ["LEASE", "MasterPhase", "Pose", "Rover", "TrackEnd"]

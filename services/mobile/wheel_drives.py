@@ -28,10 +28,10 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.services.comm.canopen.master import (
     CanopenMaster,
     Companion,
-    MasterPhase,
+    MasterPhase as MasterPhase,
     Power,
     Supervision,
-    Trouble,
+    Trouble as Trouble,
     companion_transfers,
     pdo_transfers,
     unfit,
@@ -173,6 +173,3 @@ class WheelMaster(CanopenMaster[WheelLink]):
     def _take_echoes(self, data: bytes) -> None:
         if len(data) == ECHOES.size:
             self.echoes.append(data)
-
-
-__all__ = ["MasterPhase", "Trouble", "WheelLink", "WheelMaster"]

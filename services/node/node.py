@@ -234,7 +234,9 @@ class Node:
         self._watch = UNWATCHED if virtual else Watchdog(name, LinkTiming().silence)
         services = [s for s in directory.services.values() if s.node == name and s.run]
         waiting = {
-            s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))
+            s.name: ActionEntry(s.name, s.run, "", s.node)
+            for s in services
+            if inspect.iscoroutinefunction(resolve(s.run))
         }
         self.places: dict[str, Host] = {
             **places,
@@ -655,10 +657,6 @@ class Node:
             text = f"stream {stream!r} is not received at the moment"
             return Outcome(call.id, Status.ERROR, {}, "not_ready", text, Executed.NO)
         return Outcome(call.id, Status.SUCCESS, address)
-
-
-def _as_action(service: ServiceEntry) -> ActionEntry:
-    return ActionEntry(service.name, service.run, "", service.node)
 
 
 def stream_service(stream: str) -> str:

@@ -69,16 +69,6 @@ class TrackSpecification(Specification):
         """Whether predictions are judged by where and when the ball was seen to leave."""
         return self.place_within > 0.0
 
-    @property
-    def most_place(self) -> float:
-        """Greatest error of predictions along the near edge (m)."""
-        return self.place_within or self.max_place_spread
-
-    @property
-    def most_time(self) -> float:
-        """Greatest error of predictions in time (s)."""
-        return self.time_within or self.max_time_spread
-
 
 async def track(
     ctx: Context,
@@ -352,7 +342,9 @@ class _Chase:
         time_off = max(abs(time - left) for time, _ in judged)
         place_off = max(abs(y - place) for _, y in judged)
         values |= {"time_spread": time_off, "place_spread": place_off}
-        if time_off > asked.most_time or place_off > asked.most_place:
+        most_time = asked.time_within or asked.max_time_spread
+        most_place = asked.place_within or asked.max_place_spread
+        if time_off > most_time or place_off > most_place:
             what = "were off" if cause == "off" else "moved"
             text = f"predictions {what} by {time_off * 1e3:.0f} ms and {place_off * 1e3:.0f} mm"
             return failure(cause, text, **values)

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from petrobot.services.comm.protocol.messages import EMERGENCY_STOP as EMERGENCY_STOP
-from petrobot.services.comm.protocol.messages import SEED
+from petrobot.services.comm.protocol.messages import EMERGENCY_STOP as EMERGENCY_STOP, SEED
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.device import Driver, stop_at_once
 from petrobot.services.worker.callables import RAISED, describe, log_fault, words_of

@@ -9,8 +9,7 @@ goes into every record (docs/physics.md).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as installed
+from importlib.metadata import PackageNotFoundError, version as installed
 from importlib.util import find_spec
 from typing import Any, Final, Protocol
 

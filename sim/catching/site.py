@@ -168,7 +168,8 @@ class CupMount:
     def solid_parts(self, q: Sequence[float]) -> tuple[Any, Any]:
         """Return the capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m,
         base frame."""
-        return self._arm.solid_parts(self._true(q), self._bottom)
+        true = [angle + zero for angle, zero in zip(q, self._zero, strict=True)]
+        return self._arm.solid_parts(true, self._bottom)
 
     def load(self, mass: float, radius: float, depth: float) -> PrincipalInertia:
         """Return the cup as a body on the flange (kg, m): a thin tube around its axis."""
@@ -178,9 +179,6 @@ class CupMount:
         return PrincipalInertia(
             mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2])
         )
-
-    def _true(self, q: Sequence[float]) -> list[float]:
-        return [angle + zero for angle, zero in zip(q, self._zero, strict=True)]
 
 
 Triple = tuple[float, float, float]

@@ -10,8 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
 from petrobot.coordinator.analysis.execution.names import MISSING

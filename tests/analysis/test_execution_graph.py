@@ -10,8 +10,7 @@ from itertools import cycle
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, assume, event, find, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, assume, event, find, given, settings, strategies as st
 
 from petrobot.coordinator.analysis.execution.causes import explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of

@@ -16,8 +16,7 @@ from petrobot.coordinator.analysis.commands import (
     convert_command,
     simulate_command,
 )
-from petrobot.coordinator.analysis.formats import losses, read_net, tree
-from petrobot.coordinator.analysis.formats import pnml as formats_pnml
+from petrobot.coordinator.analysis.formats import losses, pnml as formats_pnml, read_net, tree
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.formats.tree import local
 from petrobot.coordinator.analysis.net.coverability import coverability, find_pump

@@ -6,8 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from petrobot.coordinator.analysis.net import graph as graphs
 from petrobot.coordinator.analysis.net.deadlocks import hunt_deadlock

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from petrobot.coordinator.analysis.net.explore import ExplorationEngine, Explored, IntegerEngine
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine

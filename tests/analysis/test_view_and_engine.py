@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, event, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, event, example, given, settings, strategies as st
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
 from petrobot.coordinator.analysis.execution.chain import (

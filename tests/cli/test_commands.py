@@ -19,8 +19,7 @@ import pytest
 from petrobot.coordinator.analysis import commands, may_run
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
-from petrobot.coordinator.cli import COMMANDS, Subcommand, loading, main
-from petrobot.coordinator.cli import analyse as cli_analyse
+from petrobot.coordinator.cli import COMMANDS, Subcommand, analyse as cli_analyse, loading, main
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -385,10 +384,10 @@ def test_a_task_without_error_branch_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`check` and `run` both refuse it, naming place and remedy."""
-    from petrobot.coordinator.cli.new import TASK
+    from petrobot.coordinator.cli.new import skeleton
 
     path = tmp_path / "broken.toml"
-    broken = TASK.replace("{name}", "broken").replace(
+    broken = skeleton("task.toml", "broken").replace(
         '[transitions.failed]\nin = ["work:error"]\nout = ["recover"]\n', ""
     )
     path.write_text(broken, encoding="utf-8")
@@ -404,10 +403,10 @@ def test_a_task_that_can_deadlock_is_refused(
 ) -> None:
     """Without its `final_error` the skeleton can reach a dead marking: the file has no fault, but
     the state space shows it."""
-    from petrobot.coordinator.cli.new import TASK
+    from petrobot.coordinator.cli.new import skeleton
 
     path = tmp_path / "stuck.toml"
-    text = TASK.replace("{name}", "stuck")
+    text = skeleton("task.toml", "stuck")
     path.write_text(text, encoding="utf-8")
     assert (
         main(["check", str(path)]) == 2
@@ -647,10 +646,10 @@ def test_a_given_up_run_says_why(
 ) -> None:
     """After an argument of a wrong type, the terminal and the JSON have its action, node and text,
     and how to record more."""
-    from petrobot.coordinator.cli.new import TASK
+    from petrobot.coordinator.cli.new import skeleton
 
     monkeypatch.chdir(tmp_path)
-    broken = TASK.replace("{name}", "broken").replace(
+    broken = skeleton("task.toml", "broken").replace(
         'work = { kind = "action" }', 'work = { kind = "action", args = { force = "x" } }'
     )
     Path("pressing.py").write_text(PRESSING, encoding="utf-8")

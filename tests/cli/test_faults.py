@@ -15,11 +15,11 @@ import pytest
 
 from petrobot.coordinator.analysis.may_run import Budget
 from petrobot.coordinator.cli import COMMANDS, main
-from petrobot.coordinator.cli.new import TASK
+from petrobot.coordinator.cli.new import skeleton
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import Party
 
-WORK = TASK.replace("{name}", "work")
+WORK = skeleton("task.toml", "work")
 CELL = """\
 schema = 1
 [nodes.robot]

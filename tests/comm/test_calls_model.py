@@ -8,8 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.services.comm.calls.callee import Callee, Offer, Retention
 from petrobot.services.comm.calls.caller import Caller, LateResult

@@ -9,13 +9,11 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.party import Envelope, Posted
-from petrobot.services.comm.protocol import codec
-from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol import codec, messages as m
 from petrobot.services.comm.protocol.codec import (
     LIMITS,
     MAX_CONTAINERS,

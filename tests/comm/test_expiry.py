@@ -15,8 +15,7 @@ from typing import Any
 
 import pytest
 from cryptography import x509
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.node_status import ask_all

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.services.comm.lockstep.cell import CellError, Delays, LockStepCell
 from petrobot.services.comm.lockstep.mesh import Member, PartyLostError

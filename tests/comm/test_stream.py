@@ -11,8 +11,7 @@ from itertools import count
 
 import msgpack
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.security import KeyNeededError

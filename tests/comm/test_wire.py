@@ -8,8 +8,7 @@ from typing import Any
 
 import msgpack
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS, decode, encode

@@ -151,7 +151,7 @@ def test_the_command_opens_a_macro_place(tmp_path: Path) -> None:
         CommandError, match="no macro place 'nowhere'; it has inner, outer, use"
     ) as caught:
         show.run(parser.parse_args([str(task), "--inside", "nowhere", "--out", str(out)]))
-    assert caught.value.code == 2
+    assert caught.value.exit_code == 2
 
 
 SHORT = """

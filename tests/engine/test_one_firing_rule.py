@@ -14,11 +14,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
-from petrobot.coordinator.analysis.net.explore import ExplorationEngine as Explorer
-from petrobot.coordinator.analysis.net.explore import Explored, IntegerEngine
+from petrobot.coordinator.analysis.net.explore import (
+    ExplorationEngine as Explorer,
+    Explored,
+    IntegerEngine,
+)
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
 from petrobot.coordinator.analysis.net.pack import Layout, concession
 from petrobot.coordinator.analysis.time.gspn import Gspn

@@ -7,8 +7,7 @@ import json
 from collections import Counter
 
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, assume, given, settings, strategies as st
 
 from petrobot.coordinator.engine import (
     Begin,

@@ -6,8 +6,7 @@ from __future__ import annotations
 from math import comb, inf, isnan
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.coordinator.learning.estimate import Observation, Tally
 from petrobot.coordinator.learning.objective import (

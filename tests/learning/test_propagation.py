@@ -8,8 +8,7 @@ from math import exp, hypot, isnan, sqrt
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.stats import t as student
 
 from petrobot.coordinator.analysis.time.completion import completion

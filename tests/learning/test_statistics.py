@@ -7,8 +7,7 @@ from math import inf, isnan
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.coordinator.learning.estimate import Observation, Tally
 from petrobot.coordinator.learning.objective import Question, compare

@@ -27,8 +27,7 @@ from petrobot.coordinator.studies.campaign.observed import observation
 from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import loads
-from petrobot.services.action import Context, Result, error, success
-from petrobot.services.action import Status as ActionStatus
+from petrobot.services.action import Context, Result, Status as ActionStatus, error, success
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.scripted import Scripted, ScriptedRun
 from tests.learning.cell import TASK_FILE, directory, scripts, sorting

@@ -12,8 +12,7 @@ from math import exp, sqrt
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from petrobot.coordinator.analysis.execution.chain import played as mission_figures
 from petrobot.coordinator.analysis.execution.graph import execute

@@ -6,8 +6,7 @@ import math
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.services.mobile.odometry import Pose
 from petrobot.services.mobile.paths import arc, arc_through, join, passes, resume_poses, straight

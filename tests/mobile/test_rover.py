@@ -11,8 +11,7 @@ import pytest
 
 from petrobot.services.comm.canopen.cia402 import DriveFault
 from petrobot.services.mobile import driving
-from petrobot.services.mobile.odometry import Pose as Odo
-from petrobot.services.mobile.odometry import turned
+from petrobot.services.mobile.odometry import Pose as Odo, turned
 from petrobot.services.mobile.paths import arc
 from petrobot.services.rehearsal import Rehearsal, rehearse
 from tests.mobile.conftest import DrawnFloor, DrawnPose

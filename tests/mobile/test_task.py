@@ -13,8 +13,7 @@ from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.task import Scope, Task
 from petrobot.coordinator.task.check import check
 from petrobot.coordinator.task.file import load
-from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.location_file import load as load_directory
+from petrobot.services.comm.location_file import Directory, load as load_directory
 
 ROOT = Path(__file__).parents[2]
 PATH = ROOT / "coordinator" / "tasks" / "follow_track.toml"

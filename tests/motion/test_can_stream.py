@@ -11,8 +11,7 @@ from typing import Any
 
 import can
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.services.comm.canopen.bus import CanBus, Frame
 from petrobot.services.comm.canopen.byte_stream import (

@@ -5,11 +5,9 @@ from __future__ import annotations
 import struct
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from petrobot.services.comm.canopen import cia301 as canopen
-from petrobot.services.comm.canopen import cia402
+from petrobot.services.comm.canopen import cia301 as canopen, cia402
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import (
     AbortCode,

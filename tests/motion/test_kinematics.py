@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.services.motion.kinematics import BRANCHES, Puma, branch_of
 from petrobot.services.motion.model import nominal_arm

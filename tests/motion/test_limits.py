@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, example, given, settings, strategies as st
 
 from petrobot.services.host.numba_kernels import COMPILED, plain
 from petrobot.services.motion.kinematics import Puma

@@ -24,8 +24,7 @@ from petrobot.services.node.emergency_stops import AGAIN, GUARD_LOOK, SILENCE, G
 from petrobot.services.worker.device_process import DeviceLoop
 from petrobot.services.worker.pipe import Pipe
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
-from tests.node.test_device_process import Moving, Process, states
-from tests.node.test_device_process import Ports as NoPorts
+from tests.node.test_device_process import Moving, Ports as NoPorts, Process, states
 from tests.node.test_driver_faults import OneNode, cell
 from tests.node.test_processes import PATIENCE, Operator, operator_of
 

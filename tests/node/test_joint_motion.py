@@ -7,8 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot import Axis, Driver, JointMotion, check_driver
 from petrobot.services.device import faults_of_keys

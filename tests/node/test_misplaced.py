@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.location_file import DirectoryError, load, parse
-from petrobot.services.comm.location_file import code as location_code
+from petrobot.services.comm.location_file import DirectoryError, code as location_code, load, parse
 from petrobot.services.comm.location_file.host_checks import misplaced, signatures
 from petrobot.services.comm.protocol.security import is_loopback
 from tests.cli.test_mistakes import said as told

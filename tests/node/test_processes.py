@@ -31,9 +31,14 @@ from petrobot.services.comm.protocol.messages import (
     Outcome,
 )
 from tests.node.conftest import OUTSIDE
-from tests.node.test_lockstep import CALLS, Coordinator, World, trace_of
-from tests.node.test_lockstep import CELL as LOCKSTEP
-from tests.node.test_lockstep import Bench as LockstepBench
+from tests.node.test_lockstep import (
+    CALLS,
+    CELL as LOCKSTEP,
+    Bench as LockstepBench,
+    Coordinator,
+    World,
+    trace_of,
+)
 from tests.ports import free_ports
 from tests.processes import alive, children
 from tests.waiting import Limit

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.services.worker.setpoints import Outlets, Sent, SetpointReceiver
 from tests.node.conftest import Clock

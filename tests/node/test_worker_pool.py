@@ -4,8 +4,7 @@ and every run ends once."""
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.services.comm.protocol.messages import Answer, Call, Cancel, Command, Outcome
 from petrobot.services.node.inline_host import HOLD, answer_of

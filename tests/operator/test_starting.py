@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 import pytest_asyncio
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator import station

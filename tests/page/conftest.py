@@ -23,8 +23,7 @@ from petrobot.coordinator.task.file import load
 from tests.page.stage import Part, Stage
 
 if TYPE_CHECKING:
-    from playwright.async_api import Browser, ConsoleMessage, Locator, ViewportSize
-    from playwright.async_api import Page as Tab
+    from playwright.async_api import Browser, ConsoleMessage, Locator, Page as Tab, ViewportSize
 
 HERE = Path(__file__).parent
 HEADLESS_SHELL = Path("/usr/bin/chromium-headless-shell")

@@ -10,8 +10,7 @@ from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Literal, Protocol
 
-from playwright.async_api import Browser, Locator, Route, expect
-from playwright.async_api import Page as Tab
+from playwright.async_api import Browser, Locator, Page as Tab, Route, expect
 
 from petrobot.coordinator.page.server import Page
 from tests.page.conftest import PATIENCE_MS, new_window, note_toasts

@@ -39,8 +39,7 @@ from tests.page.test_changes import changes
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, expect
-from playwright.async_api import Page as Tab
+from playwright.async_api import Browser, Page as Tab, expect
 
 from tests.page.steps import (
     Watch,

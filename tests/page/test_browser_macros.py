@@ -17,8 +17,7 @@ from tests.page.stage import Stage
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, expect
-from playwright.async_api import Page as Tab
+from playwright.async_api import Browser, Page as Tab, expect
 
 from tests.page.steps import element, hold_controls, opened
 

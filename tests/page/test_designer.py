@@ -35,8 +35,7 @@ from tests.page.stage import Stage
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, Locator, Route, WebSocketRoute, expect
-from playwright.async_api import Page as Tab
+from playwright.async_api import Browser, Locator, Page as Tab, Route, WebSocketRoute, expect
 
 from tests.page.steps import click_canvas, element, settled
 from tests.waiting import until

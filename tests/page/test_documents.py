@@ -25,9 +25,7 @@ from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.session import LearningSetting
 from petrobot.coordinator.operator import history as journals
 from petrobot.coordinator.operator.prepare import RunRequest, prepare
-from petrobot.coordinator.page import edits
-from petrobot.coordinator.page import task_store as store
-from petrobot.coordinator.page import task_work as verdicts
+from petrobot.coordinator.page import edits, task_store as store, task_work as verdicts
 from petrobot.coordinator.page.access import HEADERS
 from petrobot.coordinator.page.server import Page, start_page
 from petrobot.coordinator.page.task_work import as_task_file

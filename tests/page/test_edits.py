@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.coordinator.page.edits import EditError, Rename, edited, parse, plain
 from tests.page.test_formatting import sent_back

@@ -21,8 +21,7 @@ from tests.page.conftest import abort, browser_missing, toasted
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, expect
-from playwright.async_api import Page as Tab
+from playwright.async_api import Browser, Page as Tab, expect
 
 from tests.page.steps import Watch, checked, draw_the_task, element, hold_controls, opened, settled
 from tests.ports import free_ports

@@ -21,8 +21,7 @@ from tests.page.conftest import PATIENCE_MS, browser_missing
 if browser_missing() and os.environ.get("CI") != "true":
     pytest.skip(browser_missing(), allow_module_level=True)
 
-from playwright.async_api import Browser, Locator, expect
-from playwright.async_api import Page as Tab
+from playwright.async_api import Browser, Locator, Page as Tab, expect
 
 from tests.page.steps import Watch, element, opened
 from tests.waiting import until

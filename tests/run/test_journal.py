@@ -16,8 +16,7 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.coordinator.run.journal import MAGIC, JournalError, JournalWriter, read_journal
 from petrobot.services.comm.protocol.codec import LIMITS, encode

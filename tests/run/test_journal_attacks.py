@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.engine import Begin, Engine
 from petrobot.coordinator.launch import resumed_mission
@@ -24,6 +23,7 @@ from petrobot.coordinator.run.journal import (
 )
 from petrobot.coordinator.run.recording import JournalStore, ReplayError
 from petrobot.services.comm.protocol import messages as m
+from petrobot.services.host.toml_text import InputError
 from tests.run.toy_arm import WORK, Bench
 from tests.waiting import Limit
 
@@ -113,7 +113,7 @@ def test_another_format_is_named_with_its_remedy(tmp_path: Path, magic: bytes, s
     """Replay, log and resume end with one line, and leave the file unchanged."""
     path = copy(tmp_path, magic + GOLDEN.read_bytes()[8:])
     before = path.read_bytes()
-    with pytest.raises(CommandError, match=says):
+    with pytest.raises(InputError, match=says):
         recorded(str(path))
     with pytest.raises(JournalError, match=says):
         JournalWriter(path)
@@ -130,7 +130,7 @@ def test_a_header_of_another_format_is_refused(tmp_path: Path) -> None:
 def test_an_incomplete_header_is_refused(tmp_path: Path) -> None:
     """The journal was written by another tool."""
     JournalWriter(tmp_path / "run.journal", {"mission": "m"}).close()
-    with pytest.raises(CommandError, match="its header has no 'mode'"):
+    with pytest.raises(InputError, match="its header has no 'mode'"):
         recorded(str(tmp_path))
 
 

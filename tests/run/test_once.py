@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.coordinator.engine import Begin, RunRecorded
 from petrobot.coordinator.run.calls import STOP_MARGIN

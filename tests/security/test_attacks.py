@@ -18,8 +18,7 @@ from typing import Any
 
 import msgpack
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, UnevenMotion, fly
 

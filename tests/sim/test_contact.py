@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
 from petrobot.sim.catching.ball_contact import contact_at, numbers_of

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.services.host import numba_kernels as compiled
 from petrobot.services.host.numba_kernels import COMPILED, SWITCH, packed
-from petrobot.sim.catching import arm_motion
-from petrobot.sim.catching import site as cup_motion
+from petrobot.sim.catching import arm_motion, site as cup_motion
 from petrobot.sim.catching.arm_motion import (
     Matrix,
     Six,

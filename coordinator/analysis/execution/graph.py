@@ -29,7 +29,7 @@ from petrobot.coordinator.analysis.execution.names import (
     Cause,
     Names,
     Orders,
-    TooManyValues,
+    TooManyValues as TooManyValues,
     literals_of,
 )
 from petrobot.coordinator.analysis.limits import overtime
@@ -793,6 +793,3 @@ def _fired(said: tuple[Instruction, ...]) -> tuple[str, ...]:
 
 def _reports(said: tuple[Instruction, ...], key: str) -> bool:
     return any(isinstance(i, Report) and i.key == key for i in said)
-
-
-__all__ = ["MOVES", "STEPS", "ExecutionGraph", "Step", "TooManyValues", "execute"]

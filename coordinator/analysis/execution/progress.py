@@ -1035,15 +1035,16 @@ class _Again:
         self.label = label[order]
         self.steps = (*x.steps, Step(NEXT, x.first, Begin()))
 
+    def _fired_in(self, component: int) -> set[str]:
+        """Return the transitions that fire within a strong component."""
+        ours = self.graph.components[self.graph.source]
+        labels = np.unique(self.label[ours == component]).tolist()
+        return set[str]().union(*(self.steps[n].firings for n in labels))
+
     def in_every_bottom(self) -> set[str]:
         """Return the transitions that fire again and again in every bottom component."""
-        every: set[str] | None = None
-        ours = self.graph.components[self.graph.source]
-        for component in np.flatnonzero(self.graph.bottom).tolist():
-            labels = np.unique(self.label[ours == component]).tolist()
-            fired = set[str]().union(*(self.steps[n].firings for n in labels))
-            every = fired if every is None else every & fired
-        return every or set()
+        bottoms = map(self._fired_in, np.flatnonzero(self.graph.bottom).tolist())
+        return set.intersection(*bottoms) if self.graph.bottom.any() else set()
 
     def without(
         self, wanted: Mapping[str, frozenset[str]], verb: str, nothing: str
@@ -1051,12 +1052,10 @@ class _Again:
         """Return a state from which one of the wanted firings never happens again, and which one,
         in words. `wanted`: names, each with transitions of which one must fire."""
         components = self.graph.components
-        ours = components[self.graph.source]
         _, entered = np.unique(components, return_index=True)
         nearest = np.argsort(entered)
         for component in nearest[self.graph.bottom[nearest]].tolist():
-            labels = np.unique(self.label[(ours == component)]).tolist()
-            fired = set[str]().union(*(self.steps[n].firings for n in labels))
+            fired = self._fired_in(component)
             never = [name for name, some in wanted.items() if not fired & some]
             if never:
                 first = int(np.argmax(components == component))

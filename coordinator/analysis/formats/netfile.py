@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.task.net import Arcs, Net
-from petrobot.services.host.toml_text import TomlError, read_toml
+from petrobot.services.host.toml_text import InputError, TomlError, read_toml
 
 FILE = "the net in the file"
 """What stays unknown if the time is used up before a file has been read."""
@@ -26,7 +26,7 @@ BETWEEN = 1_000
 """Elements or arcs of a file between two looks at the clock."""
 
 
-class NetFileError(ValueError):
+class NetFileError(InputError, ValueError):
     """A file cannot be read or a net cannot be written: file, line, element, problem, remedy."""
 
     def __init__(

@@ -208,9 +208,10 @@ def explore(
     """
     limits = limits or SearchLimits(memory=memory_limit())
     started = limits.clock() if limits.clock else 0.0
+    found: ExplorationEngine
     if engine in ("auto", "integers"):
         layout = Layout.for_net(net, least=NARROW)
-        name, found = "integers", _plain_engine(net, layout, edges)
+        name, found = "integers", IntegerEngine(Explored.start(net, layout, edges))
         budget = HANDOVER if engine == "auto" else None
     else:
         layout = Layout.for_net(net, least=2)
@@ -230,10 +231,6 @@ def explore(
 
 INTERRUPTED = "interrupted"
 """`Space.reason` of a search that was ended by Ctrl-C."""
-
-
-def _plain_engine(net: Net, layout: Layout, edges: bool) -> ExplorationEngine:
-    return IntegerEngine(Explored.start(net, layout, edges))
 
 
 _HAND_OVER = "hand over"

@@ -27,16 +27,15 @@ from petrobot.coordinator.run.mission import Mission, MissionError
 from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.trials import CostOf, TrialLog
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.task.file import TaskFileError
-from petrobot.coordinator.task.file import load as load_task
+from petrobot.coordinator.task.file import TaskFileError, load as load_task
 from petrobot.services.comm.location_file import (
     DRY_RUN,
     FIRST_PHYSICS,
     Directory,
     DirectoryError,
+    load as load_directory,
     same_physics,
 )
-from petrobot.services.comm.location_file import load as load_directory
 from petrobot.services.comm.lockstep.cell import CellError, Delays, LockStepCell
 from petrobot.services.comm.lockstep.party import TICK, Party
 

@@ -17,6 +17,7 @@ from typing import Any
 
 from petrobot.services.comm.location_file import MOCK, SIMULATED, same_physics
 from petrobot.services.host.json_text import json_text
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import write_whole
 
 SEEDS = 1_000_000
@@ -27,7 +28,7 @@ TASK_COPY = "task.toml"
 SCHEMA = 1
 
 
-class CampaignError(Exception):
+class CampaignError(InputError):
     """A campaign cannot begin or continue; the text names file, key and remedy."""
 
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.studies.campaign.plan import TABLE as TABLE
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError
+from petrobot.coordinator.studies.campaign.plan import TABLE as TABLE, Block, CampaignError
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, waits_of
 from petrobot.coordinator.task import Kind, Task
 from petrobot.services.host.json_text import json_text

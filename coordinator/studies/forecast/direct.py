@@ -19,8 +19,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta, betabinom, f, norm
-from scipy.stats import t as student
+from scipy.stats import beta, betabinom, f, norm, t as student
 
 from petrobot.coordinator.learning.statistics import clopper_pearson
 from petrobot.coordinator.studies.forecast.choices import choices_of

@@ -17,8 +17,7 @@ from petrobot.coordinator.analysis.may_run import Cell, devices_of
 from petrobot.coordinator.analysis.net.ordinary import contended
 from petrobot.coordinator.analysis.time.measured import LATE, is_cause
 from petrobot.coordinator.analysis.time.whatif import Change
-from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
-from petrobot.coordinator.learning.estimate import Tally
+from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE, Tally
 from petrobot.coordinator.learning.estimates_file import (
     EstimatesError,
     EstimatesFile,
@@ -34,6 +33,7 @@ from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import EarlyEvent, End, EventMemory, Kind, Status, Task, Transition
 from petrobot.coordinator.task.conditions import Domain, Expression, equivalent
 from petrobot.coordinator.task.validation import condition_domains, marking_domains
+from petrobot.services.host.toml_text import InputError
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -47,7 +47,7 @@ CUT = 1
 STATUSES: Final[tuple[Status, ...]] = tuple(Status)
 
 
-class ForecastError(Exception):
+class ForecastError(InputError):
     """A forecast file cannot be made or used; the text says why."""
 
 

@@ -115,17 +115,13 @@ def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
             _interval(row["interval"]),
             _number(row["measured"]) or "none completed",
             _p(row),
-            _agrees(row),
+            {None: "", True: "yes", False: "NO"}[row["agrees"]],
             f"{'yes' if row['equivalent'] else 'no'} (within {_number(row['margin'])})"
             if row["margin"]
             else "",
         )
         for row in found["rows"]
     ]
-
-
-def _agrees(row: Mapping[str, Any]) -> str:
-    return "" if row["agrees"] is None else "yes" if row["agrees"] else "NO"
 
 
 def _p(row: Mapping[str, Any]) -> str:

@@ -95,11 +95,7 @@ class Chart:
 
     @property
     def _top(self) -> int:
-        return TOP + 18 * self._legend_rows
-
-    @property
-    def _legend_rows(self) -> int:
-        return len(self._placed()[1]) if self.legend else 0
+        return TOP + 18 * (len(self._placed()[1]) if self.legend else 0)
 
     def line(self, points: Sequence[tuple[float, float]], name: str, number: int) -> None:
         """Add a curve with its own colour and dash."""

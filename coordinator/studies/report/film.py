@@ -27,6 +27,7 @@ from petrobot.coordinator.studies.report.raster import png
 from petrobot.coordinator.task import End, Task
 from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
 from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.host.toml_text import InputError
 
 Picture = NDArray[np.uint8]
 FORMATS = (".webp", ".gif", ".png")
@@ -36,7 +37,7 @@ SAME = 1e-3
 """Greatest difference of the times of two firings (s): a journal rounds them."""
 
 
-class NoFilmError(ValueError):
+class NoFilmError(InputError, ValueError):
     """The film cannot be made; the text says why and what to do."""
 
 

@@ -62,7 +62,7 @@ def _points(
         for key in (("x", "y", "x2", "y2") if plot.get("kind") == "lines" else ("x", "y"))
     ]
     groups: dict[str, list[tuple[tuple[float, ...], str]]] = {}
-    for i, row in enumerate(_thinned(rows)):
+    for i, row in enumerate(rows[:: max(1, -(-len(rows) // MOST))]):
         place = [_number(row.get(name)) for name in names]
         if not any(math.isnan(v) for v in place):
             tip = ", ".join(
@@ -122,10 +122,6 @@ def _group(plot: Mapping[str, Any], row: Mapping[str, Any]) -> str:
 
 def _sorted(groups: Mapping[str, Any]) -> dict[str, Any]:
     return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
-
-
-def _thinned(rows: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
-    return rows[:: max(1, -(-len(rows) // MOST))]
 
 
 def _number(value: Any) -> float:

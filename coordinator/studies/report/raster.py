@@ -13,6 +13,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from petrobot.services.host.toml_text import InputError
+
 SCALE = 2.0
 """Pixels of the PNG for each pixel of the SVG: sharp on dense screens and in print."""
 PAPER = "#ffffff"
@@ -22,7 +24,7 @@ FONT = Path(__file__).parent / "fonts" / "DejaVuSans.ttf"
 FAMILY = "DejaVu Sans"
 
 
-class RasterError(Exception):
+class RasterError(InputError):
     """No PNG can be made; the text says what is missing or wrong and what to do."""
 
 

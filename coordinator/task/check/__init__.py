@@ -15,12 +15,15 @@ from petrobot.coordinator.task.check.completeness import (
     unoffered,
 )
 from petrobot.coordinator.task.check.conflicts import conflicts
-from petrobot.coordinator.task.check.findings import NEVER_MARKED, CheckReport, Finding, in_file
+from petrobot.coordinator.task.check.findings import (
+    NEVER_MARKED,
+    CheckReport as CheckReport,
+    Finding as Finding,
+    in_file as in_file,
+)
 from petrobot.coordinator.task.compiled_task import endless
 from petrobot.coordinator.task.validation import faults
-from petrobot.coordinator.task.wording import Severity, few, listed
-
-__all__ = ["CheckReport", "Finding", "Severity", "check", "in_file"]
+from petrobot.coordinator.task.wording import Severity as Severity, few, listed
 
 # --- checks of the flow of tokens ---
 # They need no state space: cycles without time, places that are never marked, ends at the

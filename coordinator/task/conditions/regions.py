@@ -10,7 +10,7 @@ gap as there are such names.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise, product
@@ -18,7 +18,6 @@ from math import ceil, floor, prod
 from typing import Any
 
 from petrobot.coordinator.task.conditions.language import (
-    And,
     Compare,
     ConditionFault,
     Expression,
@@ -26,7 +25,6 @@ from petrobot.coordinator.task.conditions.language import (
     Name,
     Node,
     Not,
-    Or,
     as_literal,
     is_number,
     walk,
@@ -223,17 +221,13 @@ def _kind(node: Node, domains: Mapping[str, Domain], faults: list[str]) -> str:
     if isinstance(node, Compare):
         _compare_kinds(node, domains, faults)
         return "bool"
-    for part in _operands(node):
+    for part in (node.operand,) if isinstance(node, Not) else node.operands:
         kind = _kind(part, domains, faults)
         if kind not in ("bool", "?"):
             faults.append(
                 f"the operand at column {part.at + 1} is a {kind}, neither true nor false"
             )
     return "bool"
-
-
-def _operands(node: Not | And | Or) -> Iterator[Node]:
-    yield from (node.operand,) if isinstance(node, Not) else node.operands
 
 
 def _compare_kinds(node: Compare, domains: Mapping[str, Domain], faults: list[str]) -> None:

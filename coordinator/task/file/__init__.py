@@ -10,10 +10,13 @@ from typing import Any
 
 from petrobot.coordinator.task import Kind, Place, Reference, Subnet, Task, Transition
 from petrobot.coordinator.task.conditions import Expression
-from petrobot.coordinator.task.file.reading import SCHEMA, TaskFileError, load, loads, write_arc
-
-__all__ = ["TaskFileError", "dumps", "load", "loads"]
-
+from petrobot.coordinator.task.file.reading import (
+    SCHEMA,
+    TaskFileError as TaskFileError,
+    load as load,
+    loads as loads,
+    write_arc,
+)
 
 # --- writing: canonically, so the same task always gives the same text ---
 

@@ -39,10 +39,17 @@ from petrobot.coordinator.task.conditions import ConditionError, Expression, par
 from petrobot.coordinator.task.expansion import written
 from petrobot.coordinator.task.validation import faults as task_faults
 from petrobot.coordinator.task.wording import Fault, nearest
-from petrobot.services.host.toml_text import TomlError, key_lines, line_of, not_utf8, read_toml
+from petrobot.services.host.toml_text import (
+    InputError,
+    TomlError,
+    key_lines,
+    line_of,
+    not_utf8,
+    read_toml,
+)
 
 
-class TaskFileError(ValueError):
+class TaskFileError(InputError, ValueError):
     """A task file that cannot be used. `faults` are all that is wrong; `lines[i]` is the line of
     fault i (0: unknown)."""
 

@@ -34,11 +34,7 @@ from typing import Any, Final
 import msgpack
 
 from petrobot.services.comm.calls.events import KEPT, EventBoard
-from petrobot.services.comm.calls.peers import (
-    Inline,
-    Offer,
-    Peers,
-)
+from petrobot.services.comm.calls.peers import Inline as Inline, Offer as Offer, Peers
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
     Accept,
@@ -302,14 +298,6 @@ class ResultStore:
         self.gone.add(id_)
         self._forgotten(id_)
 
-
-__all__ = [
-    "Callee",
-    "Inline",
-    "Offer",
-    "Order",
-    "Retention",
-]
 
 ERROR: Final = "error"
 HOLD, RELEASE, HELD = "hold", "release", "held"

@@ -379,7 +379,6 @@ each number of a source comes once. Answer: `ok` is False, with `cause` in the d
 gave none.
 """
 
-__all__ = ["Caller", "LateResult", "Notice", "Patience", "PeerLost"]
 
 ERROR: Final = "error"
 

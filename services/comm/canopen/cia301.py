@@ -176,14 +176,16 @@ def parse_emergency(frame: Frame) -> Emergency:
 
 # Command byte (CiA 301, section 7.2.4.3.3): 001 in the top bits (initiate download), then the
 # number of unused bytes, e = 1 (expedited), s = 1 (size indicated).
-def sdo_write_request(node: int, index: int, sub: int, data: bytes) -> Frame:
-    """Return the request of an expedited download of 1 to 4 bytes."""
+def _expedited(cob_id: int, command: int, index: int, sub: int, data: bytes) -> Frame:
     if not 1 <= len(data) <= 4:
         raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
-    command = 0x23 | (4 - len(data)) << 2
-    return Frame(
-        SDO_REQUEST_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
-    )
+    command |= (4 - len(data)) << 2
+    return Frame(cob_id, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"))
+
+
+def sdo_write_request(node: int, index: int, sub: int, data: bytes) -> Frame:
+    """Return the request of an expedited download of 1 to 4 bytes."""
+    return _expedited(SDO_REQUEST_BASE + node, 0x23, index, sub, data)
 
 
 def sdo_read_request(node: int, index: int, sub: int) -> Frame:
@@ -198,12 +200,7 @@ def sdo_write_reply(node: int, index: int, sub: int) -> Frame:
 
 def sdo_read_reply(node: int, index: int, sub: int, data: bytes) -> Frame:
     """Return the server's answer to an upload, 1 to 4 bytes."""
-    if not 1 <= len(data) <= 4:
-        raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
-    command = 0x43 | (4 - len(data)) << 2
-    return Frame(
-        SDO_REPLY_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
-    )
+    return _expedited(SDO_REPLY_BASE + node, 0x43, index, sub, data)
 
 
 def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:

@@ -20,7 +20,7 @@ from typing import Any
 from petrobot.services.comm.location_file import reading as directory_file
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import COORDINATOR
-from petrobot.services.host.toml_text import not_utf8
+from petrobot.services.host.toml_text import InputError, not_utf8
 
 _log = logging.getLogger(__name__)
 COORDINATOR_PORT = directory_file.COORDINATOR_PORT
@@ -33,7 +33,7 @@ MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.li
 """Services of the node that has the global memory."""
 
 
-class DirectoryError(Exception):
+class DirectoryError(InputError):
     """services.toml is invalid, or a name is not in it. `faults` has one line per fault, with its
     remedy."""
 

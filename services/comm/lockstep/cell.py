@@ -25,6 +25,7 @@ from petrobot.services.comm.protocol.plain import (
     is_numpy,
     plain,
 )
+from petrobot.services.host.toml_text import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,8 +41,10 @@ _Due = tuple[int, str, int, Envelope]
 """Tick sent, source, sequence, envelope."""
 
 
-class CellError(Exception):
+class CellError(InputError):
     """A lock-step cell cannot continue; the text names the party and what to do."""
+
+    exit_code = 3
 
 
 class Delays:

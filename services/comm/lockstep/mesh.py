@@ -32,7 +32,12 @@ from typing import Final, Protocol
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.location_file.host_checks import cannot_listen
-from petrobot.services.comm.lockstep.cell import CellError, Delays, LocalParties, LockStepCell
+from petrobot.services.comm.lockstep.cell import (
+    CellError as CellError,
+    Delays as Delays,
+    LocalParties,
+    LockStepCell as LockStepCell,
+)
 from petrobot.services.comm.lockstep.party import Party, Posted
 from petrobot.services.comm.protocol.messages import (
     COORDINATOR,
@@ -59,8 +64,6 @@ from petrobot.services.comm.protocol.wire import (
     Side,
 )
 from petrobot.services.comm.tls.credentials import shared_keys
-
-__all__ = ["CellError", "Delays", "LockStepCell", "Member", "PartyLostError", "TickLink"]
 
 
 class PartyLostError(CellError):

@@ -38,7 +38,7 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.plain import (
     LARGEST,
-    MAX_CONTAINERS,
+    MAX_CONTAINERS as MAX_CONTAINERS,
     MOST_VALUES,
     SCALARS,
     NotPlainError,
@@ -47,18 +47,6 @@ from petrobot.services.comm.protocol.plain import (
     pack_array,
     unpack_array,
 )
-
-__all__ = [
-    "LIMITS",
-    "MAX_CONTAINERS",
-    "UNCOUNTED",
-    "ProtocolError",
-    "decode",
-    "decode_by_table",
-    "decode_kind",
-    "encode",
-]
-
 
 NAME_LENGTH: Final = 255
 """Longest name, id or code (characters)."""
@@ -218,7 +206,6 @@ WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {
 """Fast writer by kind: returns the array that is the body, or None if the table must look at the
 message."""
 
-__all__ += ["encode_all", "kind_of", "no_extension", "read_fields", "unpack"]
 
 KIB, MIB = 1024, 1024 * 1024
 

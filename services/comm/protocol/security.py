@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Protocol
 from zlib import crc32
 
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import write_whole
 
 NONCE_BYTES = 32
@@ -51,7 +52,7 @@ class _Hash(Protocol):
     def digest(self) -> bytes: ...
 
 
-class KeyNeededError(Exception):
+class KeyNeededError(InputError):
     """A socket that other hosts can reach must not be opened without a key."""
 
 
@@ -81,7 +82,7 @@ def require_key(name: str, host: str, key: Keys | bool | None) -> None:
         )
 
 
-class KeyFileError(Exception):
+class KeyFileError(InputError):
     """A key file cannot be used; the text says why and what to do."""
 
 

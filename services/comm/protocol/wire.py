@@ -27,7 +27,7 @@ from petrobot.services.comm.protocol.codec import (
     NAME_LENGTH,
     READERS,
     UNCOUNTED,
-    ProtocolError,
+    ProtocolError as ProtocolError,
     decode,
     decode_by_table,
     encode,
@@ -161,16 +161,6 @@ LAST = frozenset((Bye.KIND, Refuse.KIND))
 """Kinds that end the connection."""
 OVER = (ConnectionPhase.CLOSING, ConnectionPhase.CLOSED)
 
-
-__all__ = [
-    "NEWEST_VERSION",
-    "OLDEST_VERSION",
-    "Connection",
-    "ConnectionState",
-    "ProtocolError",
-    "Side",
-    "negotiate",
-]
 
 OLDEST_VERSION: Final = 2
 NEWEST_VERSION: Final = 2

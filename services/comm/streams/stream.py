@@ -192,8 +192,6 @@ class StreamConnection:
         return messages
 
 
-__all__ = ["STALE_AFTER", "Incoming", "Inlet", "Sink", "StreamReceiver", "StreamSender"]
-
 _CONNECTIONS: Final = 16
 _ADMITTED: Final = 4
 """Connections accepted per poll, so that strangers do not delay the servo loop that polls."""

@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from petrobot.services.comm.tls.credentials import CA_FILE, RENEW_CA, SOON
+from petrobot.services.host.toml_text import InputError
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 CA_KEY = "ca.key"
@@ -30,7 +31,7 @@ CLOCKS = timedelta(days=1)
 it was made."""
 
 
-class CertificateError(Exception):
+class CertificateError(InputError):
     """The certificates cannot be made; the text says why and what to do."""
 
 

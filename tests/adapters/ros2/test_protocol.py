@@ -8,8 +8,7 @@ from enum import StrEnum
 from typing import Any
 
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 from petrobot.services.adapters.ros2.bridge import (
     RUNNING,

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot import Rehearsal, check_driver, rehearse
 from petrobot.services.adapters.so101 import actions, bus

@@ -5,8 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from petrobot.services.adapters.ur.rtde import Recipe, Rtde, RtdeError, package
 from petrobot.sim.bus.ur_controller import RTDE_PORT, UrController

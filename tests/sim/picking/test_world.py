@@ -6,8 +6,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from petrobot.sim.picking.parts import Part, contact, rectangle
 from tests.sim.picking.bench import ABOVE, DOWN, FINGERS, Crane, cube, puck

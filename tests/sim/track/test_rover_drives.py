@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import DataType, heartbeat, sdo_write_request
-from petrobot.services.comm.canopen.cia301 import NmtState as Network
+from petrobot.services.comm.canopen.cia301 import (
+    DataType,
+    NmtState as Network,
+    heartbeat,
+    sdo_write_request,
+)
 from petrobot.services.comm.canopen.cia402 import (
     DriveFault,
     DriveState,

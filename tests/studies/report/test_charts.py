@@ -12,11 +12,9 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from petrobot.coordinator.studies.report import charts, raster
-from petrobot.coordinator.studies.report import page as colours
+from petrobot.coordinator.studies.report import charts, page as colours, raster
 from petrobot.coordinator.studies.report.charts import Chart, Scale, limits
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
