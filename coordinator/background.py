@@ -173,7 +173,7 @@ def analysed(
     Yield the verdicts, and all `findings` of `petrobot check`, first, then the same with the
     forecast, because that may take long. Raises TaskFileError.
     """
-    from dataclasses import replace
+    from msgspec.structs import replace
 
     from petrobot.coordinator.analysis.may_run import BUDGET, Cell, devices_of
     from petrobot.coordinator.analysis.report import AnalysisRequest, analyse, with_forecast

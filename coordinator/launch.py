@@ -8,9 +8,11 @@ import secrets
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import Engine, Point
 from petrobot.coordinator.run.executor import Executor
@@ -52,8 +54,7 @@ SCRIPTED = "petrobot.services.scripted:load"
 Substitutes = Mapping[str, Callable[..., Any]]
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(Struct, frozen=True):
     """What a mission run is given: the task with its parameters, runs and seed, and who selects
     actions."""
 

@@ -23,13 +23,14 @@ import symtable
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib.util import decode_source
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType
 from typing import Any, get_args, get_type_hints
+
+from msgspec import Struct, field
 
 import petrobot
 from petrobot.services import action as actions
@@ -91,8 +92,7 @@ ANSWERS = ("state", "stopped", "hold", "picture")
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
 
 
-@dataclass
-class _Seen:
+class _Seen(Struct):
     """Findings in the code of one import path."""
 
     faults: list[tuple[str, int, str]] = field(default_factory=list)
@@ -156,8 +156,7 @@ class _Seen:
             places |= getattr(other, one) | places
 
 
-@dataclass(frozen=True)
-class _Code:
+class _Code(Struct, frozen=True, dict=True):
     """The source of one function or class."""
 
     tree: ast.AST

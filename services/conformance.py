@@ -18,7 +18,6 @@ import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from importlib import import_module
 from inspect import signature
@@ -26,6 +25,9 @@ from itertools import pairwise
 from pathlib import Path
 from resource import RUSAGE_THREAD, getrusage
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
@@ -96,8 +98,7 @@ ELSEWHERE: Command = dict.fromkeys("xyz", (1e6, 2e6))
 """A workspace that no command ends in."""
 
 
-@dataclass
-class DriverCheck:
+class DriverCheck(Struct):
     """The findings. `faults` is empty for a driver that keeps the rules."""
 
     faults: list[str] = field(default_factory=list)

@@ -8,9 +8,10 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.services.action import Result, Status, error
 from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict
@@ -29,8 +30,7 @@ class StillRunningError(AssertionError):
     """The action had not ended after the rehearsal's limit."""
 
 
-@dataclass
-class Rehearsal:
+class Rehearsal(Struct):
     """What an action did: its result, and everything that it sent, with the simulated time since
     its begin (s)."""
 

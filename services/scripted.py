@@ -19,9 +19,10 @@ events = [{ after = 0.1, name = "contact", data = { force = 2.0 } }]
 from __future__ import annotations
 
 from collections.abc import Awaitable, Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.services.action import Context, Result, Status, success
 from petrobot.services.comm.location_file.reading import nearest
@@ -35,8 +36,7 @@ class ScriptError(Exception):
     """A script file is refused; one line for each fault."""
 
 
-@dataclass(frozen=True, slots=True)
-class ScriptedEvent:
+class ScriptedEvent(Struct, frozen=True):
     """An event that a scripted run raises, with the seconds after its beginning."""
 
     after: float
@@ -44,8 +44,7 @@ class ScriptedEvent:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class ScriptedRun:
+class ScriptedRun(Struct, frozen=True):
     """What one run does: status, cause and values after a time drawn from `seconds` = (shortest,
     longest)."""
 

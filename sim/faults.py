@@ -18,16 +18,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.services.comm.canopen.bus import Frame
 
 
-@dataclass(frozen=True, slots=True)
-class InjectedFault:
+class InjectedFault(Struct, frozen=True):
     """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor
     or joint (from 1)."""
 
@@ -39,8 +38,7 @@ class InjectedFault:
     """Whether it lasts until its end, or happens once."""
 
 
-@dataclass(frozen=True, slots=True)
-class FaultKinds:
+class FaultKinds(Struct, frozen=True):
     """The faults of one laboratory: the keys of each, and the number of drives."""
 
     keys: Mapping[str, tuple[str, ...]]

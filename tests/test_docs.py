@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from msgspec.structs import replace
 from tools.proof.__main__ import FIGURES, kept, proofs, stands
 from tools.proof.page import figures
 from tools.proof.proof import FigureProof

@@ -15,10 +15,11 @@ import time
 import venv
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from msgspec import Struct
+from msgspec.structs import replace
 
 from tests.cli.test_new import on_free_port
 from tests.integration.cell_files import services_file
@@ -39,8 +40,7 @@ FOREIGN = 'raise ImportError("the wrong package was imported")\n'
 LIMIT = 300.0
 
 
-@dataclass
-class Installed:
+class Installed(Struct):
     """An environment with the wheel, and a folder of a user."""
 
     python: Path

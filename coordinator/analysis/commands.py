@@ -8,12 +8,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from math import hypot, isfinite, isnan, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
 from petrobot.coordinator.analysis.execution.progress import progress_of
@@ -84,8 +85,7 @@ CellOf = Callable[[Task], Cell | None]
 """Returns the cell in which a task runs; None: there is no location file."""
 
 
-@dataclass(frozen=True, slots=True)
-class CommandResult:
+class CommandResult(Struct, frozen=True):
     """The result of a command: exit code, text for the terminal, plain data."""
 
     code: int

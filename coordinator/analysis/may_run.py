@@ -7,9 +7,11 @@ answer, not in the question.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import EventOccurred, Phase
 from petrobot.coordinator.task import End, Input, Kind, Scope, Status, Task, Transition
@@ -34,8 +36,7 @@ if TYPE_CHECKING:  # the search needs numpy, which a command that only reads the
     from petrobot.coordinator.engine import State
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
+class Cell(Struct, frozen=True):
     """What a location file offers."""
 
     offers: Mapping[str, str]
@@ -62,8 +63,7 @@ def assumed(cell: Cell | None) -> str:
     return f"two runs never use one device at a time; the devices are those of {cell.source}"
 
 
-@dataclass(frozen=True, slots=True)
-class Budget:
+class Budget(Struct, frozen=True):
     """What a judgement may cost. It is counted in states and not in seconds, so that a task gets
     the same verdict on every machine."""
 
@@ -106,8 +106,7 @@ WORDS: Mapping[str, str] = {
 """A sentence for each verdict that needs to be true."""
 
 
-@dataclass(frozen=True, slots=True)
-class MayRun:
+class MayRun(Struct, frozen=True):
     """The answer. `analysis` is None where no search was asked for or the file is inconsistent."""
 
     task: Task

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from math import isnan, sqrt
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.chain import MissionFigures, played
 from petrobot.coordinator.analysis.execution.graph import (
@@ -66,8 +67,7 @@ from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import COLUMNS, few, together, wrapped
 
 
-@dataclass(frozen=True)
-class StructureReport:
+class StructureReport(Struct, frozen=True, dict=True):
     """Structural properties of a net, computed on first access: invariants, siphons, traps."""
 
     net: Net
@@ -160,8 +160,7 @@ VERDICT = 26
 """Columns before the reason of a verdict in the text."""
 
 
-@dataclass(frozen=True)
-class Analysis:
+class Analysis(Struct, frozen=True, dict=True):
     """The result of `analyse`. For a task, `net` is its ordinary net, `progress` judges its
     execution graph, and `qualitative` has the bounds that its ends net N gives."""
 
@@ -514,8 +513,7 @@ class Analysis:
         ]
 
 
-@dataclass(frozen=True, slots=True)
-class AnalysisRequest:
+class AnalysisRequest(Struct, frozen=True):
     """How a task is analysed; `analyse` explains the fields."""
 
     measured: Measured | None = None

@@ -10,9 +10,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
+
+from msgspec import Struct
 
 from petrobot.services.host.command_line import leave_threads
 from petrobot.services.host.emergency_latch import uptime
@@ -78,8 +79,7 @@ PIPE_CLOSED = 128 + 13
 """Exit code of a program that SIGPIPE has ended: 1 would say that the answer is no."""
 
 
-@dataclass(frozen=True, slots=True)
-class Subcommand:
+class Subcommand(Struct, frozen=True):
     """One sub-command. Its module is imported only when it is used: quick commands stay quick."""
 
     name: str

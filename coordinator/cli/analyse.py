@@ -7,9 +7,10 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, OutOfTime, until
 from petrobot.coordinator.cli import CommandError

@@ -8,9 +8,10 @@ import asyncio
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (

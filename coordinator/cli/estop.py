@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+from msgspec.structs import asdict
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (

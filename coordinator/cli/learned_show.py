@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import reduce
 from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import UNKNOWN, write_json

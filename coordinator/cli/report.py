@@ -7,9 +7,10 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli import CommandError, file_of
 from petrobot.coordinator.cli.loading import add_json_argument, load_task, pictures_of, write_json

@@ -8,9 +8,10 @@ import contextlib
 import json
 import sys
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli.loading import write_json
 from petrobot.coordinator.cli.options import add_log_level_argument, recorded

@@ -22,10 +22,11 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from itertools import pairwise
 from math import inf
+
+from msgspec import Struct, field
 
 Point = tuple[float, float]
 Edge = tuple[str, str]
@@ -261,8 +262,7 @@ def _longest_paths(before: Mapping[str, Sequence[str]]) -> dict[str, int]:
     return layers
 
 
-@dataclass(frozen=True, slots=True)
-class NodePositions:
+class NodePositions(Struct, frozen=True):
     """A position for every node, and the points through which long arcs run."""
 
     at: Mapping[str, Point]

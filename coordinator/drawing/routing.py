@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, starmap
 from math import ceil, copysign, dist, hypot, inf
+
+from msgspec import Struct
 
 from petrobot.coordinator.drawing.layout import Point
 from petrobot.coordinator.drawing.scene import RADIUS, Arc, DrawnNode, Scene
@@ -36,8 +37,7 @@ _CHARACTER = 0.565
 """Mean width of a character, relative to the font size."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArcPath:
+class ArcPath(Struct, frozen=True):
     """A smooth curve from border to border: a quadratic B-spline over its control points.
 
     `bend` is the distance of a single control point from the straight line.
@@ -84,8 +84,7 @@ def _point(pieces: Sequence[tuple[Point, Point, Point]], s: float) -> Point:
     return a * x0 + b * x1 + c * x2, a * y0 + b * y1 + c * y2
 
 
-@dataclass(frozen=True, slots=True)
-class LabelBox:
+class LabelBox(Struct, frozen=True):
     """The label of a node: start of its first baseline, text anchor, and the box that it covers."""
 
     node: DrawnNode

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.drawing.layout import Edge, Point, lay_out, lay_out_blocks
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
@@ -14,8 +16,7 @@ from petrobot.coordinator.task.wording import listed
 # Which part of a task is drawn: all of it with its macro places closed, or the inside of one.
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
+class Sheet(Struct, frozen=True):
     """One level of a task: the whole, or the inside of a macro place.
 
     `task` is the net that it is part of: the task itself, or one with the net of a subnet.
@@ -166,8 +167,7 @@ TURNS = 4
 """The most firings of one transition that are numbered along a path."""
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnNode:
+class DrawnNode(Struct, frozen=True):
     """A place or a transition: `style` are its CSS classes, `lines` its label, `hint` its
     tooltip."""
 
@@ -196,8 +196,7 @@ class DrawnNode:
         return (thickness, BAR[1]) if self.upright else (BAR[1], thickness)
 
 
-@dataclass(frozen=True, slots=True)
-class Caption:
+class Caption(Struct, frozen=True):
     """Label, tooltip and CSS classes of one node of a net."""
 
     lines: tuple[str, ...]
@@ -205,8 +204,7 @@ class Caption:
     style: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Blocks:
+class Blocks(Struct, frozen=True):
     """The element of a flat task (`of`) that each node of a net stands for in part: the net is laid
     out as the task is."""
 
@@ -214,8 +212,7 @@ class Blocks:
     of: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class Overlay:
+class Overlay(Struct, frozen=True):
     """Information drawn over a scene: halos of places or transitions (0 to 1), a path of
     firings."""
 
@@ -242,8 +239,7 @@ class Overlay:
         return replace(node, heat=share, turns=", ".join(told), hint=hint)
 
 
-@dataclass(frozen=True, slots=True)
-class Arc:
+class Arc(Struct, frozen=True):
     """An arc between two nodes. `kind`: plain, normal, error, preempt, going or inhibitor."""
 
     source: str
@@ -253,14 +249,13 @@ class Arc:
     style: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
+class Scene(Struct, frozen=True):
     """Everything in a drawing."""
 
     title: str
     text: str
     nodes: Mapping[str, DrawnNode]
-    arcs: tuple[Arc, ...] = field(default=())
+    arcs: tuple[Arc, ...] = ()
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
     """Points through which the layout leads an arc, by its two ends."""
     legend: str = ""

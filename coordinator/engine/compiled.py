@@ -4,8 +4,10 @@ tokens, a variable or an event change."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.task import EarlyEvent, Kind, Place, PrimitiveTask, Task
 from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions, endless
@@ -18,8 +20,7 @@ FIRINGS_OF_A_FINITE_NET: Final = 1_000_000
 tokens; they take half a minute."""
 
 
-@dataclass(frozen=True)
-class Compiled:
+class Compiled(Struct, frozen=True):
     """The immutable compiled form of a task."""
 
     task: Task

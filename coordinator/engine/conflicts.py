@@ -4,9 +4,10 @@ are decided."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from math import inf
+
+from msgspec import Struct
 
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Claims, Match, eligible_runs, match
@@ -15,8 +16,7 @@ from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.wording import Severity
 
 
-@dataclass(frozen=True, slots=True)
-class Draw:
+class Draw(Struct, frozen=True):
     """A conflict that a draw by weight decides."""
 
     alternatives: tuple[str, ...]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from enum import StrEnum
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.task import Counts, Executed, Status, Value
 from petrobot.coordinator.task.conditions import ConditionError, parse
@@ -14,8 +15,7 @@ from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import Severity as Severity
 
 
-@dataclass(frozen=True, slots=True)
-class StartRun:
+class StartRun(Struct, frozen=True):
     """Start an action. Sent once for each run, when its action is chosen and its device is free."""
 
     run: str
@@ -27,8 +27,7 @@ class StartRun:
     """Longest duration of the run (s)."""
 
 
-@dataclass(frozen=True, slots=True)
-class CancelRun:
+class CancelRun(Struct, frozen=True):
     """Stop a run. The answer is `StopConfirmed`, `StopFailed` or, if it ended by itself meanwhile,
     `RunEnded`."""
 
@@ -39,15 +38,13 @@ class CancelRun:
     """Time in which the device must have stopped (s); after that its worker is killed."""
 
 
-@dataclass(frozen=True, slots=True)
-class HoldRun:
+class HoldRun(Struct, frozen=True):
     """The operator pauses: ask the run to hold. The answer is `RunHeld`."""
 
     run: str
 
 
-@dataclass(frozen=True, slots=True)
-class ReleaseRun:
+class ReleaseRun(Struct, frozen=True):
     """Let the run continue after a pause."""
 
     run: str
@@ -60,8 +57,7 @@ class Subject(StrEnum):
     CONFLICT = "conflict"
 
 
-@dataclass(frozen=True, slots=True)
-class Choose:
+class Choose(Struct, frozen=True):
     """Choose one of the alternatives. The answer is `Chosen` with the same key.
 
     For an action, `of` is the primitive task, the key is the run's id, and a selector chooses. For
@@ -76,8 +72,7 @@ class Choose:
     weights: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class ArmTimer:
+class ArmTimer(Struct, frozen=True):
     """Send `TimerFired` with this key after `seconds`."""
 
     key: str
@@ -85,29 +80,25 @@ class ArmTimer:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class DisarmTimer:
+class DisarmTimer(Struct, frozen=True):
     """Cancel the timer."""
 
     key: str
 
 
-@dataclass(frozen=True, slots=True)
-class HoldTimer:
+class HoldTimer(Struct, frozen=True):
     """Stop the timer and keep its remaining time."""
 
     key: str
 
 
-@dataclass(frozen=True, slots=True)
-class ReleaseTimer:
+class ReleaseTimer(Struct, frozen=True):
     """Let the timer continue with its remaining time."""
 
     key: str
 
 
-@dataclass(frozen=True, slots=True)
-class Fired:
+class Fired(Struct, frozen=True):
     """Record: a transition fired. `cause` is the kind of stimulus, or `stability` if an earlier
     firing made it fireable."""
 
@@ -120,8 +111,7 @@ class Fired:
     """The runs whose tokens it took."""
 
 
-@dataclass(frozen=True, slots=True)
-class Marked:
+class Marked(Struct, frozen=True):
     """Record: the operator changed the tokens of a control place, or, without `place`, the mission
     run began at another marking."""
 
@@ -130,8 +120,7 @@ class Marked:
     after: Marking
 
 
-@dataclass(frozen=True, slots=True)
-class RunRecorded:
+class RunRecorded(Struct, frozen=True):
     """Record for the estimates: how a run ended. Status None means censored: only its duration
     counts."""
 
@@ -159,8 +148,7 @@ class RunRecorded:
         return f"{reason}, {counts}{own}"
 
 
-@dataclass(frozen=True, slots=True)
-class Corrected:
+class Corrected(Struct, frozen=True):
     """Record for the estimates: a deferred verdict replaces the recorded status of a run."""
 
     run: str
@@ -172,8 +160,7 @@ class Corrected:
     text: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(Struct, frozen=True):
     """A message for people. `key` is a fixed word for programs, `of` the element concerned.
 
     A journal's digest covers the text, too: a message in other words makes older journals that have
@@ -186,22 +173,19 @@ class Report:
     of: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Paused:
+class Paused(Struct, frozen=True):
     """Record: the net is paused, and why."""
 
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Resumed:
+class Resumed(Struct, frozen=True):
     """Record: the net continues; `steps` is 1 for a single firing, 0 for no limit."""
 
     steps: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Finished:
+class Finished(Struct, frozen=True):
     """Record: the mission run has finished. SUCCESS: `final` was reached. ERROR: `final_error` was
     reached, or it is dead or aborted."""
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import operator, runs
 from petrobot.coordinator.engine.compiled import compile_task

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import verdict_variables

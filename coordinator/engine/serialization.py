@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import types
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields, is_dataclass
 from enum import StrEnum
 from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from msgspec import NODEFAULT, Struct
+from msgspec.structs import FieldInfo, fields
 
 from petrobot.coordinator.engine.instructions import Instruction
 from petrobot.coordinator.engine.state import State
@@ -49,7 +51,7 @@ def point_from_plain(data: Mapping[str, Any]) -> Point:
 
 
 def _plain(value: Any) -> Any:
-    if is_dataclass(value):
+    if isinstance(value, Struct):
         return _fields(value)
     if isinstance(value, StrEnum):
         return value.value
@@ -60,14 +62,19 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
+@cache
+def _described(cls: type[Struct]) -> tuple[FieldInfo, ...]:
+    return fields(cls)
+
+
 def _fields(record: Any) -> dict[str, Any]:
     name = type(record).__name__
     plain: dict[str, Any] = {"kind": name} if name in _KINDS else {}
-    for f in fields(record):
+    for f in _described(record.__class__):
         value = getattr(record, f.name)
-        if f.default is not MISSING and value == f.default and type(value) is type(f.default):
+        if value == f.default and type(value) is type(f.default):
             continue
-        if f.default_factory is not MISSING and not value:
+        if f.default_factory is not NODEFAULT and not value:
             continue
         plain[f.name] = _plain(value)
     return plain
@@ -82,7 +89,7 @@ def _reader(hint: Any) -> Reader:
         return _union_reader(hint)
     if get_origin(hint) is not None:
         return _container_reader(get_origin(hint), get_args(hint))
-    if is_dataclass(hint):
+    if isinstance(hint, type) and issubclass(hint, Struct):
         return _record_reader(hint)
     if isinstance(hint, type) and issubclass(hint, StrEnum):
         return _enum_reader(hint)
@@ -109,9 +116,7 @@ def _container_reader(origin: Any, args: tuple[Any, ...]) -> Reader:
 
 def _record_reader(cls: Any) -> Reader:
     hints = get_type_hints(cls)
-    required = {
-        f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING
-    }
+    required = {f.name for f in fields(cls) if f.required}
 
     def read(value: Any, where: str) -> Any:
         data = _of(value, Mapping, where)

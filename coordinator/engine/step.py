@@ -4,8 +4,9 @@ of the mission run."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from petrobot.coordinator.engine.compiled import Compiled
 from petrobot.coordinator.engine.conflicts import Draw, choose_step
@@ -46,8 +47,7 @@ from petrobot.coordinator.task.wording import Severity
 MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 
 
-@dataclass(frozen=True, slots=True)
-class Policy:
+class Policy(Struct, frozen=True):
     """How the engine treats conflicts, dead ends and endless firings."""
 
     firing_limit: int | None = None

@@ -4,9 +4,10 @@ keep them."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.task import Executed, Status, Value
 
@@ -14,8 +15,7 @@ if TYPE_CHECKING:
     from petrobot.coordinator.engine.state import Run
 
 
-@dataclass(frozen=True, slots=True)
-class Standing:
+class Standing(Struct, frozen=True):
     """A token in an action place at the point where a mission run begins."""
 
     place: str
@@ -25,8 +25,7 @@ class Standing:
     action: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Point:
+class Point(Struct, frozen=True):
     """Where a mission run begins, if not at the task's initial marking."""
 
     marking: Mapping[str, int] = field(default_factory=dict)
@@ -39,8 +38,7 @@ class Point:
     """Latched external events that no firing has consumed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Begin:
+class Begin(Struct, frozen=True):
     """The mission run begins, at `point` or at the task's initial marking. `parameters` replace the
     task's defaults; `variables` are the values that the global memory holds."""
 
@@ -49,15 +47,13 @@ class Begin:
     point: Point | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class RunStarted:
+class RunStarted(Struct, frozen=True):
     """The node has accepted the run. Optional: a run may also end without it."""
 
     run: str
 
 
-@dataclass(frozen=True, slots=True)
-class RunEnded:
+class RunEnded(Struct, frozen=True):
     """A run has ended. If it was cancelled, this also means that it has stopped."""
 
     run: str
@@ -75,8 +71,7 @@ class RunEnded:
     """Processor time (s), for the estimates alone; None: not measured."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunRaised:
+class RunRaised(Struct, frozen=True):
     """An active run raised one of its internal events."""
 
     run: str
@@ -89,8 +84,7 @@ class RunRaised:
         return 0 < self.number <= run.heard
 
 
-@dataclass(frozen=True, slots=True)
-class EventOccurred:
+class EventOccurred(Struct, frozen=True):
     """An external event. A source numbers its events from 1, so that none is accepted twice; 0 is
     an event without a number."""
 
@@ -104,15 +98,13 @@ class EventOccurred:
         return 0 < self.number <= seen.get(self.source, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class TimerFired:
+class TimerFired(Struct, frozen=True):
     """A timer that the engine armed has elapsed."""
 
     key: str
 
 
-@dataclass(frozen=True, slots=True)
-class VariableChanged:
+class VariableChanged(Struct, frozen=True):
     """A watched global-memory variable has a new value."""
 
     name: str
@@ -120,8 +112,7 @@ class VariableChanged:
     source: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Chosen:
+class Chosen(Struct, frozen=True):
     """The answer to a `Choose`: one of its alternatives, and the reason (such as `draw 0.31`,
     `selector: lowest J` or `operator`)."""
 
@@ -130,8 +121,7 @@ class Chosen:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class StopConfirmed:
+class StopConfirmed(Struct, frozen=True):
     """A cancelled run has stopped, or never began (`executed` is then `no`)."""
 
     run: str
@@ -139,8 +129,7 @@ class StopConfirmed:
     seconds: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class StopFailed:
+class StopFailed(Struct, frozen=True):
     """A cancelled run could not be stopped in time; its device stays fenced until a later
     `StopConfirmed`."""
 
@@ -148,8 +137,7 @@ class StopFailed:
     text: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(Struct, frozen=True):
     """The deferred verdict on a run: corrects its status once, for the estimates only."""
 
     run: str
@@ -167,80 +155,69 @@ class Hold(StrEnum):
     """The run could not pause and was stopped; its end follows."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunHeld:
+class RunHeld(Struct, frozen=True):
     """A node's answer to a `HoldRun`."""
 
     run: str
     answer: Hold
 
 
-@dataclass(frozen=True, slots=True)
-class Pause:
+class Pause(Struct, frozen=True):
     """Operator: pause. Nothing fires or starts, and active runs are asked to hold."""
 
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Resume:
+class Resume(Struct, frozen=True):
     """Operator: end the pause."""
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(Struct, frozen=True):
     """Operator: let one transition fire, now or as soon as one can, then pause again."""
 
 
-@dataclass(frozen=True, slots=True)
-class SetBreakpoints:
+class SetBreakpoints(Struct, frozen=True):
     """Operator: pause before these transitions fire and after tokens enter these places. Replaces
     the earlier set."""
 
     names: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Override:
+class Override(Struct, frozen=True):
     """Operator: always run this alternative of a primitive task; empty: choose freely again."""
 
     primitive_task: str
     action: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class AddTokens:
+class AddTokens(Struct, frozen=True):
     """Operator: put tokens into a control place."""
 
     place: str
     tokens: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class RemoveTokens:
+class RemoveTokens(Struct, frozen=True):
     """Operator: take tokens out of a control place."""
 
     place: str
     tokens: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class RaiseEvent:
+class RaiseEvent(Struct, frozen=True):
     """Operator: raise an external event by hand."""
 
     event: str
 
 
-@dataclass(frozen=True, slots=True)
-class ForceExit:
+class ForceExit(Struct, frozen=True):
     """Operator: fire a transition out of an action place whatever the state of its run, its event,
     its time and its condition. An active run is cancelled and does not count."""
 
     transition: str
 
 
-@dataclass(frozen=True, slots=True)
-class Abort:
+class Abort(Struct, frozen=True):
     """Cancel every run, and end in ERROR when all have stopped: by the operator, by an emergency
     stop, or because nothing could move the task on (`stuck`)."""
 

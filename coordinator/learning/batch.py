@@ -8,10 +8,10 @@ stored. Each J is computed from the sums when it is needed, with one rho per row
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -24,8 +24,7 @@ once or twice, too few to hide what their actions do to each other."""
 SUMS = ("tries", "runs", "successes", "cost", "squares", "costed", "missing")
 
 
-@dataclass
-class Response:
+class Response(Struct):
     """One trial of each row. All arrays have shape (rows,)."""
 
     action: Index
@@ -37,8 +36,7 @@ class Response:
     """False if the run never began; such a trial only lowers the availability."""
 
 
-@dataclass
-class Batch:
+class Batch(Struct):
     """`rows` learners over the same `n` actions. All sums have shape (rows, n)."""
 
     p: Array

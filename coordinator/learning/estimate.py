@@ -15,10 +15,12 @@ from __future__ import annotations
 from bisect import insort
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 from math import sqrt
 from typing import Any, NamedTuple
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.statistics import EMPTY, Moments, merged, whole, wilson
 from petrobot.coordinator.task import Executed, Status
@@ -39,8 +41,7 @@ class SampledRun(NamedTuple):
     """How the run ended; see `Observation.exit`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(Struct, frozen=True):
     """A uniform sample of at most `SIZE` runs, sorted by priority. It can be merged: the entries
     with the smallest priorities are kept (bottom-k sampling, E. Cohen and H. Kaplan, PODC 2007)."""
 
@@ -114,8 +115,7 @@ COUNT = "count"
 """Name of a cost measure, and of the number in a result that reports it."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class TallyKey:
+class TallyKey(Struct, frozen=True, order=True):
     """Identifies a tally: primitive task, action, and context ("" if contexts are not
     distinguished)."""
 
@@ -124,8 +124,7 @@ class TallyKey:
     context: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(Struct, frozen=True):
     """How one run ended, as the estimates need it."""
 
     status: Status | None
@@ -157,8 +156,7 @@ def is_counted(exit_: str) -> bool:
     return not exit_.startswith(CENSORED)
 
 
-@dataclass(frozen=True, slots=True)
-class Tally:
+class Tally(Struct, frozen=True):
     """Sums over runs. All mappings are sorted by key, so equal tallies have equal plain data."""
 
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
@@ -495,8 +493,7 @@ def _summed(one: Mapping[Any, int], other: Mapping[Any, int]) -> dict[Any, int]:
 # --- firings ---
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class FiringsKey:
+class FiringsKey(Struct, frozen=True, order=True):
     """Identifies the firings of a transition of a task in a context."""
 
     task: str
@@ -504,8 +501,7 @@ class FiringsKey:
     context: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Firings:
+class Firings(Struct, frozen=True):
     """Number of firings and waiting times of one transition. Immutable; can be merged."""
 
     fired: int = 0
@@ -565,16 +561,14 @@ class Firings:
         )
 
 
-@dataclass(frozen=True, order=True, slots=True)
-class TrialsKey:
+class TrialsKey(Struct, frozen=True, order=True):
     """Identifies the trials of a task in a context."""
 
     task: str
     context: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class TrialSums:
+class TrialSums(Struct, frozen=True):
     """Sums over trials of a whole task. Immutable; can be merged."""
 
     n: int = 0

@@ -18,10 +18,11 @@ import secrets
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
@@ -96,8 +97,7 @@ class EstimatesError(InputError):
     """The estimates file cannot be used; the text names the file, what is wrong and what to do."""
 
 
-@dataclass
-class FileContents:
+class FileContents(Struct):
     """Contents of a file: estimates of one plant, all origins together, and states of selectors by
     (primitive task, selector)."""
 

@@ -7,9 +7,11 @@ import secrets
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass
 from math import inf
 from typing import Any, Protocol
+
+from msgspec import Struct
+from msgspec.structs import astuple
 
 from petrobot.coordinator.learning.estimate import (
     Firings,
@@ -193,8 +195,7 @@ class Sums(Protocol):
     def to_plain(self) -> Any: ...
 
 
-@dataclass(frozen=True, slots=True)
-class SumsTable:
+class SumsTable(Struct, frozen=True):
     """A table of sums: a row holds an origin, the parts of a key, the version, and the sums as
     JSON."""
 

@@ -10,11 +10,13 @@ recorded steps and so reaches the same state as a run that was never interrupted
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import nan
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import State
 from petrobot.coordinator.engine.instructions import (
@@ -61,25 +63,23 @@ class ContextError(ValueError):
     """The task cannot distinguish this context."""
 
 
-@dataclass(frozen=True)
-class Contexts:
-    """What distinguishes contexts: names of parameters and variables, and conditions on them."""
+class Contexts(Struct, frozen=True, dict=True):
+    """What distinguishes contexts: names of parameters and variables, and conditions on them.
+    Raises ContextError for one that cannot be read."""
 
     parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Parse the conditions. Raises ContextError."""
+        """Parse the conditions."""
         try:
-            parsed = tuple(parse_condition(part) for part in self.parts)
+            _ = self.conditions
         except ConditionError as fault:
             raise ContextError(f"context: {fault}") from fault
-        object.__setattr__(self, "_conditions", parsed)
 
-    @property
+    @cached_property
     def conditions(self) -> tuple[Expression, ...]:
         """The parsed parts."""
-        parsed: tuple[Expression, ...] = self._conditions  # type: ignore[attr-defined]
-        return parsed
+        return tuple(parse_condition(part) for part in self.parts)
 
     def check(self, task: Task) -> None:
         """Raise ContextError if a name is neither a parameter nor a variable of the task."""
@@ -114,8 +114,7 @@ def _judged(condition: Expression, values: Mapping[str, Any]) -> str:
         return "unknown"
 
 
-@dataclass
-class _ActiveRun:
+class _ActiveRun(Struct):
     """A run whose token is in its place."""
 
     entered: float
@@ -125,8 +124,7 @@ class _ActiveRun:
     ended: RunEnded | None = None
 
 
-@dataclass
-class _Trial:
+class _Trial(Struct):
     """A token on its way, from the runs place until every token is back."""
 
     number: int

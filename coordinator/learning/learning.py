@@ -8,11 +8,12 @@ the same order yield the same state.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.estimate import (
     Firings,
@@ -53,8 +54,7 @@ def corrected(tally: Tally, record: Correction) -> Tally:
     return tally.correcting(record.was, record.status, record.cause)
 
 
-@dataclass
-class Estimates:
+class Estimates(Struct):
     """Tallies, firings and sums of trials from one source: the file of a machine, or what one
     session has gained."""
 

@@ -13,10 +13,12 @@ with one rho; J values made with different rho are never averaged. Intervals of 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import reduce
 from math import inf, isfinite, isnan, nan, sqrt
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.estimate import Tally, TrialSums
 from petrobot.coordinator.learning.statistics import (
@@ -34,8 +36,7 @@ are approximate: with 2 to 60 runs each, and without this factor, one of two equ
 lower J "for sure" in up to 12.5 % of cases (2 of 2 beside 0 of 2), with it in at most 3.1 %."""
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
+class Question(Struct, frozen=True):
     """What is asked: cost measure, target reliability R_d, rho (None: 1 / max C) and confidence
     level."""
 
@@ -43,7 +44,7 @@ class Question:
     target: float | None = None
     rho: float | None = None
     level: float = 0.95
-    declared: tuple[tuple[str, float], ...] = field(default=(), compare=False)
+    declared: tuple[tuple[str, float], ...] = ()
     """Costs that the task file declares, by action, in the unit of its own measure: C of an action
     without a measured cost."""
 
@@ -52,8 +53,7 @@ class Question:
         return dict(self.declared).get(action, nan)
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
+class Figures(Struct, frozen=True):
     """Figures of one action in one comparison. Costs are in the unit of the measure."""
 
     action: str
@@ -107,8 +107,7 @@ class Figures:
         return self.scenario is not None
 
 
-@dataclass(frozen=True, slots=True)
-class Comparison:
+class Comparison(Struct, frozen=True):
     """The alternatives of one primitive task compared with each other, in the given order."""
 
     rho: float
@@ -347,8 +346,7 @@ def reliability_for(figures: Iterable[Figures], budget: float) -> Figures | None
 # --- the whole task ---
 
 
-@dataclass(frozen=True, slots=True)
-class TaskFigures:
+class TaskFigures(Struct, frozen=True):
     """R, C and J of a whole task as its trials measured them. A number is followed by the bounds of
     its interval. C, rho and J are None if they are not known."""
 

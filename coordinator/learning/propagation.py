@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from math import inf, isnan, log, nan, prod, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.net.graph import sum_by
 from petrobot.coordinator.analysis.net.ordinary import contended
@@ -45,8 +46,7 @@ from petrobot.services.comm.location_file import DRY_RUN, MOCK
 # Journal of Statistics 5 (1978) 141-150.
 
 
-@dataclass(frozen=True)
-class Incidence:
+class Incidence(Struct, frozen=True):
     """Cumulative incidence of one cause: by time `times[i]` (s, increasing) the probability of
     having ended by this cause has reached `reached[i]`."""
 
@@ -432,8 +432,7 @@ def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str
 # --- figures of the task out of it ---
 
 
-@dataclass(frozen=True, slots=True)
-class Uncertain:
+class Uncertain(Struct, frozen=True):
     """A number and its confidence interval; all nan if it is unknown."""
 
     value: float
@@ -459,8 +458,7 @@ class Uncertain:
 UNKNOWN = Uncertain(nan, nan, nan)
 
 
-@dataclass(frozen=True, slots=True)
-class PrimitiveFigures:
+class PrimitiveFigures(Struct, frozen=True):
     """Figures of a primitive task, with its alternatives mixed as they are chosen: A R, mean C, J,
     and the expected number of runs in one mission run.
 
@@ -479,8 +477,7 @@ class PrimitiveFigures:
     """C of the alternative that costs most; nan if none is known."""
 
 
-@dataclass(frozen=True)
-class Propagated:
+class Propagated(Struct, frozen=True):
     """R, C and J of the task. R_conj, R_goal and P_complete are three different numbers
     (docs/analysis.md); J takes R_conj, as the paper's definition is conjunctive."""
 
@@ -565,8 +562,7 @@ def _scenarios(task: Task, estimates: Estimates) -> list[str]:
     return shared if len(shared) > 1 else []
 
 
-@dataclass(frozen=True)
-class _Solved:
+class _Solved(Struct, frozen=True, dict=True):
     """A stochastic view and its solution."""
 
     measured: Measured
@@ -678,8 +674,7 @@ def _total(visits: Visits, costs: Mapping[tuple[str, str], Uncertain]) -> float:
     return added(n * costs.get(key, UNKNOWN).value for key, n in visits.items() if n > 0)
 
 
-@dataclass(frozen=True)
-class _Move:
+class _Move(Struct, frozen=True):
     """By how much R_conj and C of the task change when R of an action is at the lower and at the
     upper end of its interval, and the correlation of success and cost over the action's runs."""
 

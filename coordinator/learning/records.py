@@ -3,16 +3,17 @@ task on choices, firings, and ends of trials."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.estimate import Observation
 from petrobot.coordinator.task import Status
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
+class Choice(Struct, frozen=True):
     """An action was chosen for a primitive task."""
 
     primitive_task: str
@@ -20,8 +21,7 @@ class Choice:
     context: str
 
 
-@dataclass(frozen=True, slots=True)
-class RunEnd:
+class RunEnd(Struct, frozen=True):
     """A run ended."""
 
     primitive_task: str
@@ -30,8 +30,7 @@ class RunEnd:
     outcome: Observation
 
 
-@dataclass(frozen=True, slots=True)
-class Correction:
+class Correction(Struct, frozen=True):
     """A deferred verdict on a run that ended provisionally before."""
 
     primitive_task: str
@@ -47,8 +46,7 @@ class Correction:
         return replace(self.was, status=self.status, cause=self.cause, judged=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Credit:
+class Credit(Struct, frozen=True):
     """The task's verdict on an action that was chosen for a token: SUCCESS if the token met the
     task's goal, with the cost of the whole trial."""
 
@@ -89,8 +87,7 @@ class Waited(NamedTuple):
         return self.end in (WaitEnd.LATEST, WaitEnd.FIRED)
 
 
-@dataclass(frozen=True, slots=True)
-class Passage:
+class Passage(Struct, frozen=True):
     """A transition fired, or a wait for its event ended without a firing."""
 
     transition: str
@@ -100,8 +97,7 @@ class Passage:
     end: WaitEnd = WaitEnd.FIRED
 
 
-@dataclass(frozen=True, slots=True)
-class TrialEnd:
+class TrialEnd(Struct, frozen=True):
     """A trial of the task has ended."""
 
     context: str

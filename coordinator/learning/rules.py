@@ -19,9 +19,8 @@ Sources:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.learning.batch import (
     SUMS,
@@ -35,7 +34,7 @@ from petrobot.coordinator.learning.batch import (
 )
 
 
-class Rule:
+class Rule(Struct, frozen=True):
     """A learning rule has parameters but no state: all state is in the batch, and all randomness is
     in the uniform numbers that the caller passes in. By default it draws and only counts."""
 
@@ -81,8 +80,7 @@ def one_hot(action: Index, n: int) -> Array:
 # --- rules that count but do not learn ---
 
 
-@dataclass(frozen=True)
-class Fixed(Rule):
+class Fixed(Rule, frozen=True):
     """Always choose the first offered alternative."""
 
     name: str = "fixed"
@@ -101,8 +99,7 @@ class Fixed(Rule):
         return "the first alternative"
 
 
-@dataclass(frozen=True)
-class RoundRobin(Rule):
+class RoundRobin(Rule, frozen=True):
     """Choose the offered alternative that was chosen least often; the first of equals."""
 
     name: str = "round_robin"
@@ -136,7 +133,7 @@ def _allowed(batch: Batch, offered: Mask) -> Mask:
     return np.where(left.any(axis=1, keepdims=True), left, offered)
 
 
-class _Bandit(Rule):
+class _Bandit(Rule, frozen=True):
     """Its p only recommends; displays and frozen selectors read it."""
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
@@ -153,8 +150,7 @@ class _Bandit(Rule):
         batch.p[:] = one_hot(batch.best(eligible), batch.n)
 
 
-@dataclass(frozen=True)
-class UCB1(_Bandit):
+class UCB1(_Bandit, frozen=True):
     """Choose the action with the largest mean payoff + sqrt(width * 2 ln k / n_a). The payoff is an
     affine function of J in [0, 1]."""
 
@@ -198,8 +194,7 @@ class UCB1(_Bandit):
         )
 
 
-@dataclass(frozen=True)
-class Thompson(_Bandit):
+class Thompson(_Bandit, frozen=True):
     """Draw R of each action from its posterior Beta(1 + successes, 1 + other runs) and choose the
     lowest J. Costs enter as their means."""
 
@@ -248,7 +243,7 @@ def _plastic(n: int) -> float:
 # --- learning automata ---
 
 
-class _TriesFirst(Rule):
+class _TriesFirst(Rule, frozen=True):
     """Each action is first chosen `trials` times, so that the estimates mean something."""
 
     trials: int
@@ -266,8 +261,7 @@ class _TriesFirst(Rule):
         return super().says(batch, offered, action)
 
 
-@dataclass(frozen=True)
-class NikolicFu(_TriesFirst):
+class NikolicFu(_TriesFirst, frozen=True):
     """The scheme of the paper: estimate R and C of the chosen action, order all actions by J, and
     move p towards the best one: p_i += gamma_k (lambda_i - p_i), where lambda is 1 at the lowest J
     and 0 elsewhere, and gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
@@ -336,8 +330,7 @@ class NikolicFu(_TriesFirst):
         return super().says(batch, offered, action) + exploring
 
 
-@dataclass(frozen=True)
-class RewardInaction(Rule):
+class RewardInaction(Rule, frozen=True):
     """L_R-I: p of the chosen action grows by step * payoff * (1 - p) and the others shrink; without
     payoff nothing changes.
 
@@ -363,8 +356,7 @@ class RewardInaction(Rule):
         batch.p += (self.step * pay)[:, None] * (one_hot(trial.action, batch.n) - batch.p)
 
 
-@dataclass(frozen=True)
-class DiscretisedPursuit(_TriesFirst):
+class DiscretisedPursuit(_TriesFirst, frozen=True):
     """DP_R-I: after each success, move p in steps of 1 / (n * resolution) towards the action with
     the lowest J.
 
@@ -399,8 +391,7 @@ class DiscretisedPursuit(_TriesFirst):
 TESTS = ("success_up", "success_down", "cost_up", "cost_down")
 
 
-@dataclass(frozen=True)
-class Tracking(_TriesFirst):
+class Tracking(_TriesFirst, frozen=True):
     """The scheme of Nikolic and Fu for a changing world. It follows changes, and therefore does not
     converge with probability 1.
 

@@ -9,12 +9,12 @@ ends of runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
 from itertools import product
 from math import prod
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Response
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
@@ -556,6 +556,6 @@ def _shorter(rule: Rule) -> Rule:
     combination."""
     if isinstance(rule, Tracking):
         return replace(rule, trials=0, gain_floor=0.1)
-    if any(f.name == "trials" for f in fields(rule)):  # type: ignore[arg-type]
-        return replace(rule, trials=TRIALS)  # type: ignore[type-var]
+    if "trials" in rule.__struct_fields__:
+        return replace(rule, trials=TRIALS)
     return rule

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.estimates_file import (
     EstimatesError,
@@ -29,8 +31,7 @@ known beforehand. If its R of an action has an error of 0.1 (standard deviation)
 0.9 * 0.1 / 0.1^2 = 9 real runs of an action with R = 0.9, and 25 of one with R = 0.5."""
 
 
-@dataclass(frozen=True)
-class LearningSetting:
+class LearningSetting(Struct, frozen=True):
     """How a mission run learns. `contexts`: what distinguishes contexts (None: the regime, if the
     task has one)."""
 

@@ -8,15 +8,15 @@ whatever the order of merges.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import reduce
 from math import ceil, inf, isfinite, nan, sqrt
 from operator import add
 from typing import Any, Protocol, Self, TypeVar
 
+from msgspec import Struct
 
-@dataclass(frozen=True, slots=True)
-class Moments:
+
+class Moments(Struct, frozen=True):
     """Count, mean, extremes and `m2`, the sum of squared deviations from the mean. Immutable."""
 
     n: int = 0

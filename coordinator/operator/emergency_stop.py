@@ -14,9 +14,10 @@ import os
 import secrets
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.run.supervisor import is_local
 from petrobot.services.comm.calls.caller import Caller, Notice, Patience, PeerLost
@@ -55,8 +56,7 @@ BUS_TIMES, BUS_PAUSE = 3, 0.01
 """How often the order is sent on the bus, and the pause between (s): one frame may be lost."""
 
 
-@dataclass
-class Stopped:
+class Stopped(Struct):
     """Result of the stop for one node's devices."""
 
     node: str

@@ -12,8 +12,9 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
+
+from msgspec import Struct, field
 
 T = TypeVar("T")
 ROUNDS = 12
@@ -35,8 +36,7 @@ ALONE = ("schema", "errors", "keys", "links", "coordinator", "parameters")
 """Tables and keys at the top that contain no elements by name."""
 
 
-@dataclass
-class FaultyFile(Generic[T]):
+class FaultyFile(Struct, Generic[T]):
     """A file that may be faulty, and what was read of it: None if nothing can be judged."""
 
     source: str

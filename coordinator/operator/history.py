@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun

@@ -10,9 +10,11 @@ import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.launch import (
     RequestError,
@@ -57,8 +59,7 @@ ONE_PROCESS, LAUNCHED, JOINED = "one process", "launched", "joined"
 and ends, or in processes that are already waiting (`petrobot up --lockstep`)."""
 
 
-@dataclass(frozen=True)
-class RecordedPoint:
+class RecordedPoint(Struct, frozen=True):
     """A point of a recorded run from which a simulated run starts."""
 
     run: str
@@ -67,8 +68,7 @@ class RecordedPoint:
     """What happens to the runs that were active then: one word for all, or words by place."""
 
 
-@dataclass(frozen=True)
-class RunRequest:
+class RunRequest(Struct, frozen=True):
     """Request for a mission run, from the options of `petrobot run` or from the page."""
 
     mode: str = REALTIME

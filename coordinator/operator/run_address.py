@@ -8,8 +8,10 @@ import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from petrobot.coordinator.run.folder import DEFAULT, NoRunError, journal_of
 from petrobot.services.host.json_text import json_text
@@ -19,8 +21,7 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 ADDRESS_FILE = "operator.json"
 
 
-@dataclass(frozen=True, slots=True)
-class RunAddress:
+class RunAddress(Struct, frozen=True):
     """Address of the coordinator of a mission run."""
 
     run: str

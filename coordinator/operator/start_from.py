@@ -11,9 +11,10 @@ start of the run."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.engine import (
     Engine,
@@ -46,8 +47,7 @@ HEADER = ("mission", "mode", "task", "services", "services_path", "seed", "runs"
 """Keys of a journal's header that are needed to replay its run."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recorded:
+class Recorded(Struct, frozen=True):
     """A recorded mission run with its task, cell and engine."""
 
     journal: Journal
@@ -88,8 +88,7 @@ class DepartureError(InputError, ValueError):
     """No run can start there: which record or word is wrong, and what is possible."""
 
 
-@dataclass(frozen=True)
-class Departure:
+class Departure(Struct, frozen=True):
     """A point of a recorded run; `point` is None at its beginning."""
 
     run: str

@@ -11,9 +11,10 @@ import asyncio
 import json
 import logging
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.learning.estimates_file import EstimatesError

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec import Struct
 
 from petrobot.coordinator.operator.faulty_files import FaultyFile
 from petrobot.coordinator.task.wording import Severity, listed
@@ -26,8 +27,7 @@ NO_DRY_RUN = "no-dry-run"
 """Code of the finding that drivers of the location file refuse a dry run."""
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(Struct, frozen=True):
     """What was found about a task in a cell."""
 
     task: FaultyFile[Task]

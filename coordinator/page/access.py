@@ -12,10 +12,11 @@ import asyncio
 import hashlib
 import hmac
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from functools import cached_property
 
 from aiohttp import web
 from aiohttp.typedefs import Middleware
+from msgspec import Struct
 
 from petrobot.services.comm.calls.link import allowed
 
@@ -43,21 +44,22 @@ NAMES = (HOST, "localhost", "[::1]")
 """Names under which browsers of this computer reach it."""
 
 
-@dataclass(frozen=True)
-class AccessRules:
+class AccessRules(Struct, frozen=True, dict=True):
     """Allow-lists and secret of one server."""
 
     token: str
     port: int
-    cookie: str = field(init=False)
-    pass_value: str = field(init=False)
-    """Value of the cookie: derived from the token, so that a leaked cookie does not reveal the
-    token."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cookie", f"petrobot_{self.port}")
-        derived = hmac.new(self.token.encode(), b"petrobot page cookie", hashlib.sha256).hexdigest()
-        object.__setattr__(self, "pass_value", derived)
+    @cached_property
+    def cookie(self) -> str:
+        """Name of the cookie."""
+        return f"petrobot_{self.port}"
+
+    @cached_property
+    def pass_value(self) -> str:
+        """Value of the cookie: derived from the token, so that a leaked cookie does not reveal the
+        token."""
+        return hmac.new(self.token.encode(), b"petrobot page cookie", hashlib.sha256).hexdigest()
 
     @property
     def hosts(self) -> frozenset[str]:

@@ -6,11 +6,11 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Coroutine, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from aiohttp import web
+from msgspec import Struct, field
 
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.operator.port import MissionPort, Offers, StartForm
@@ -25,8 +25,7 @@ CLOCK_S = 0.05
 ENCODED_KEPT = 8
 
 
-@dataclass
-class PageState:
+class PageState(Struct):
     """State of one page server."""
 
     port: MissionPort

@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import tomlkit
+from msgspec import Struct
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Array, InlineTable, Item
 from tomlkit.toml_document import TOMLDocument
@@ -37,8 +37,7 @@ class EditError(ValueError):
     """The text is not TOML, or the edit cannot be made."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rename:
+class Rename(Struct, frozen=True):
     """A renamed table: in the table at `path`, from `old` to `new`."""
 
     path: tuple[str, ...]

@@ -6,8 +6,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
-from dataclasses import dataclass
 from pathlib import Path
+
+from msgspec import Struct
 
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.page.edits import EditError, Rename, edited, parse
@@ -35,8 +36,7 @@ class Conflict(Exception):  # noqa: N818 - not an error: two people edited the s
         return f"{self.theirs.name} was changed by another user or program since you opened it"
 
 
-@dataclass(frozen=True, slots=True)
-class TaskText:
+class TaskText(Struct, frozen=True):
     """One task file as it is on disk."""
 
     name: str

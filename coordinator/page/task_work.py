@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tomlkit
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.background import RefusedError
@@ -96,8 +96,7 @@ Fields = Mapping[str, Any] | None
 """Fields of a `Cell`; None: it is not known which actions are offered."""
 
 
-@dataclass(frozen=True, slots=True)
-class ConvertedTask:
+class ConvertedTask(Struct, frozen=True):
     """A task in another format."""
 
     text: str

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import Instruction, State, Stimulus
 from petrobot.coordinator.engine.instructions import (
@@ -56,8 +58,7 @@ process, and the devices of the former one may still be in their stop routines.
 FOR_GOOD: Final = math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class Fence:
+class Fence(Struct, frozen=True):
     """A device is kept free because of a run, until a time (s) or until its node reports that the
     run has stopped."""
 
@@ -126,8 +127,7 @@ class Fences:
 # Timers that the engine armed, on the coordinator's clock.
 
 
-@dataclass(slots=True)
-class _Timer:
+class _Timer(Struct):
     due: float
     held: float | None = None
     """Seconds left while it is held."""
@@ -188,8 +188,7 @@ _GIVEN_UP: Final = UNSURE | {RESUMED, "unreachable"}
 _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
 
 
-@dataclass
-class Flight:
+class Flight(Struct):
     """A run that was handed to a node (or waits for its device's fence); `begun` is when the engine
     ordered it (s)."""
 

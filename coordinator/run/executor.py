@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.engine import Engine, Mode
 from petrobot.coordinator.engine.instructions import (
@@ -72,8 +73,7 @@ _Order = StartRun | CancelRun | HoldRun | ReleaseRun
 """Instructions that leave the process."""
 
 
-@dataclass
-class Executor:
+class Executor(Struct, dict=True):
     """Runs one mission. `callers` has one caller for each node of the directory."""
 
     task: Task

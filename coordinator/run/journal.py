@@ -24,12 +24,12 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import msgpack
+from msgspec import Struct
 
 from petrobot.coordinator.run.folder import date_back
 from petrobot.services.host.toml_text import InputError
@@ -48,8 +48,7 @@ class JournalError(InputError):
     """The journal cannot be read or written: file, place and remedy."""
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(Struct, frozen=True):
     """One line of a journal."""
 
     number: int
@@ -57,8 +56,7 @@ class Record:
     data: Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Journal:
+class Journal(Struct, frozen=True):
     """A journal read back: its header, its records in order, and how many bytes of a torn tail were
     dropped."""
 

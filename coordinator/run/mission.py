@@ -6,9 +6,11 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import Mode, State
 from petrobot.coordinator.engine.instructions import (
@@ -77,8 +79,7 @@ class MissionError(InputError):
         self.exit_code = 2 if bad_input else 1
 
 
-@dataclass(slots=True)
-class Cycle:
+class Cycle(Struct):
     """One token taken out of the runs place, and the runs that followed from it."""
 
     number: int
@@ -146,8 +147,7 @@ def _forget_oldest(entries: list[Any]) -> list[Any]:
     return oldest
 
 
-@dataclass
-class MissionTally:
+class MissionTally(Struct):
     """An observer that counts what the result needs: firings, runs, their errors and missing
     values. It keeps the newest cycles and runs. Errors of the net are logged at once: a task that
     is stuck may never have a result."""

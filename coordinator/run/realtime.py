@@ -9,10 +9,11 @@ import math
 import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from shlex import quote
 from typing import Final, TypeVar
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
@@ -52,8 +53,7 @@ def _suspended() -> float:
     return uptime() - time.monotonic()
 
 
-@dataclass
-class Punctuality:
+class Punctuality(Struct):
     """Measures how punctual the coordinator's event loop is: counts checks that should happen every
     `PERIOD` seconds."""
 

@@ -14,11 +14,11 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgpack
+from msgspec import Struct
 
 from petrobot.coordinator.engine import (
     Engine,
@@ -57,8 +57,7 @@ LONGEST_REMARK = 1_000
 """Longest remark (characters)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Remark:
+class Remark(Struct, frozen=True):
     """What an operator remarked: number of the record, time since the journal's origin (s)."""
 
     number: int
@@ -72,8 +71,7 @@ class Remark:
         return f"{self.author} remarked: {self.text}"
 
 
-@dataclass(frozen=True, slots=True)
-class TakeOver:
+class TakeOver(Struct, frozen=True):
     """Another coordinator continues the run: number of the record, time since the journal's origin
     (s), epoch."""
 
@@ -264,8 +262,7 @@ def unmeasured(data: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedStep:
+class RecordedStep(Struct, frozen=True):
     """One replayed stimulus."""
 
     number: int

@@ -15,10 +15,11 @@ import socket
 import stat
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.realtime import on_disk
@@ -47,8 +48,7 @@ class LaunchError(InputError):
     exit_code = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Program:
+class Program(Struct, frozen=True):
     """One process to keep alive: its name and command line."""
 
     name: str
@@ -57,8 +57,7 @@ class Program:
     """Whether others need it: they are started when it is ready."""
 
 
-@dataclass
-class _Child:
+class _Child(Struct):
     program: Program
     log: Path
     ready: asyncio.Event = field(default_factory=asyncio.Event)

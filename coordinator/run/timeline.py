@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import State
 from petrobot.coordinator.engine.instructions import (
@@ -18,8 +19,7 @@ from petrobot.coordinator.task import Status
 from petrobot.services.comm.protocol.messages import Feedback
 
 
-@dataclass(frozen=True, slots=True)
-class Bar:
+class Bar(Struct, frozen=True):
     """A run on the time axis (s since the timeline's origin)."""
 
     run: str
@@ -33,8 +33,7 @@ class Bar:
     text: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Firing:
+class Firing(Struct, frozen=True):
     """A transition that fired at a time (s since the timeline's origin)."""
 
     time: float
@@ -43,8 +42,7 @@ class Firing:
     cause: str
 
 
-@dataclass
-class Timeline:
+class Timeline(Struct):
     """All runs and firings of a mission run, in order."""
 
     bars: dict[str, Bar] = field(default_factory=dict)

@@ -7,7 +7,8 @@ fires by these tables and the forecast plays by them (docs/semantics.md, section
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.elements import Counts, End, Event, Input, Kind, Scope, Transition
@@ -16,8 +17,7 @@ from petrobot.coordinator.task.net import Arcs, Changes, Net, Thresholds
 from petrobot.coordinator.task.validation import is_pulse
 
 
-@dataclass(frozen=True, slots=True)
-class ActionArc:
+class ActionArc(Struct, frozen=True):
     """An arc from an action place to a transition."""
 
     place: int
@@ -32,8 +32,7 @@ class ActionArc:
     """Internal events that the run taken must have raised."""
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledTransition:
+class CompiledTransition(Struct, frozen=True):
     """A transition with everything that decides whether and how it fires."""
 
     index: int

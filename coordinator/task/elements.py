@@ -4,9 +4,10 @@ subnets as immutable records."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.task.conditions import Expression
 
@@ -110,8 +111,7 @@ class Start(StrEnum):
     yet."""
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
+class Estimate(Struct, frozen=True):
     """What the designer expects of runs that end with one status, before runs were measured."""
 
     share: float
@@ -122,8 +122,7 @@ class Estimate:
     """Standard deviation of the duration over its mean; 1 for the exponential distribution."""
 
 
-@dataclass(frozen=True, slots=True)
-class PrimitiveTask:
+class PrimitiveTask(Struct, frozen=True):
     """A step of the task with its own goal, carried out by one of several actions (paper, section
     2)."""
 
@@ -153,8 +152,7 @@ class PrimitiveTask:
     used until runs of the action were measured."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reference:
+class Reference(Struct, frozen=True):
     """An argument that is read from a variable or parameter: when the run starts, or, for a
     variable that some transition sets, when the token enters the place."""
 
@@ -166,8 +164,7 @@ MOST_TOKENS = 1_000_000_000
 become a number that no journal can store."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(Struct, frozen=True):
     """A place of the net. `x`, `y` are its drawing position (drawing units; y grows downwards)."""
 
     name: str
@@ -213,8 +210,7 @@ class Place:
         return self.servers or 1
 
 
-@dataclass(frozen=True, slots=True)
-class Input:
+class Input(Struct, frozen=True):
     """An arc from a place to a transition. `end` is set exactly on arcs out of action places (and
     macro places)."""
 
@@ -225,24 +221,21 @@ class Input:
     """Set exactly on `preempt` arcs."""
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
+class Output(Struct, frozen=True):
     """An arc from a transition to a place."""
 
     place: str
     weight: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Inhibitor:
+class Inhibitor(Struct, frozen=True):
     """An arc that disables its transition as soon as the place holds `threshold` tokens."""
 
     place: str
     threshold: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Transition:
+class Transition(Struct, frozen=True):
     """A transition: its arcs, and what must happen before it fires."""
 
     name: str
@@ -278,8 +271,7 @@ class Transition:
         return original if self.expanded_from and number[:1].isdigit() else self.name
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(Struct, frozen=True):
     """A declared event."""
 
     name: str
@@ -335,8 +327,7 @@ class VariableType(StrEnum):
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Variable:
+class Variable(Struct, frozen=True):
     """A global-memory variable that conditions and arguments may read."""
 
     name: str
@@ -367,8 +358,7 @@ class Parameter(StrEnum):
     ANY = "any"
 
 
-@dataclass(frozen=True, slots=True)
-class Subnet:
+class Subnet(Struct, frozen=True):
     """A net within the net, used through macro places; its names are prefixed with the macro
     place's."""
 

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.task.conditions import Expression, parse, rename
 from petrobot.coordinator.task.elements import (
@@ -135,8 +137,7 @@ def _with_error_branches(
 # ------------------------------------------------------------------------------------- macro places
 
 
-@dataclass(frozen=True, slots=True)
-class _Scope:
+class _Scope(Struct, frozen=True):
     """Resolves the names in one net: its own places, the parameters of its subnet, else the names
     of the task."""
 
@@ -187,8 +188,7 @@ def written(value: Value) -> str:
     raise ValueError(f"{value!r} cannot stand in a condition")
 
 
-@dataclass(frozen=True, slots=True)
-class _Flat:
+class _Flat(Struct, frozen=True):
     """The elements expanded so far, by full name."""
 
     subnets: Mapping[str, Subnet]

@@ -8,8 +8,9 @@ priorities, weights and times dropped.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.elements import (
@@ -28,8 +29,7 @@ from petrobot.coordinator.task.expansion import counters, expand
 from petrobot.coordinator.task.net import Net
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(Struct, frozen=True, dict=True, eq=False):
     """A whole robot task. It never changes; `flat` and `net` are computed once."""
 
     name: str
@@ -65,12 +65,22 @@ class Task:
     one that the command finds."""
     errors_to: str = ""
     """Place that receives the errors of action places without an `error` arc; empty: none."""
-    held: Mapping[str, tuple[str, ...]] = field(default_factory=dict, compare=False, repr=False)
+    held: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Of a flat task: the resources that a token in each place stands for, as `holds` said."""
-    expansion: Task | None = field(default=None, compare=False, repr=False)
+    expansion: Task | None = None
     """The flat task as a journal recorded it, which is what ran; None: `expand` makes it."""
-    is_flat: bool = field(default=False, compare=False, repr=False)
+    is_flat: bool = False
     """Whether the task was read as a flat one: nothing in it is written in short."""
+
+    def __eq__(self, other: object) -> bool:
+        """Two tasks are equal if they say the same, in whatever form they were written."""
+        return isinstance(other, Task) and all(
+            getattr(self, name) == getattr(other, name)
+            for name in self.__struct_fields__
+            if name not in ("held", "expansion", "is_flat")
+        )
+
+    __hash__ = None  # type: ignore[assignment]
 
     @cached_property
     def flat(self) -> Task:

@@ -4,7 +4,9 @@ firing rule in integers."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from functools import cached_property
+
+from msgspec import Struct
 
 # --- the firing rule ---
 # What each transition needs, what bars it, what it changes.
@@ -28,8 +30,7 @@ Thresholds = tuple[tuple[int, int], ...]
 """Pairs (place index, threshold), sorted by place: the place must hold fewer tokens than that."""
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledNet:
+class CompiledNet(Struct, frozen=True):
     """The firing rule, by transition.
 
     Transition t has concession in M when M(p) >= w for every (p, w) in `needs[t]` and M(p) < k for
@@ -137,8 +138,7 @@ EMPTY = "(empty)"
 """A marking without tokens, in words."""
 
 
-@dataclass(frozen=True, slots=True)
-class Net:
+class Net(Struct, frozen=True, dict=True):
     """An immutable net (P, T, Pre, Post, Inhibit, M0, capacities, priorities).
 
     `consume[t]`, `produce[t]`, `inhibit[t]` are the arcs of transition t. A transition is enabled
@@ -155,15 +155,12 @@ class Net:
     initial: Marking
     capacity: tuple[int | None, ...]
     priority: tuple[int, ...]
-    counters: frozenset[str] = field(default=frozenset(), compare=False)
+    counters: frozenset[str] = frozenset()
     """Places that a short form adds to count (`grip.left`): a text shows them only while their
     tokens differ from the initial ones."""
-    compiled: CompiledNet = field(init=False, repr=False, compare=False)
-    place_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
-    transition_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Compile the firing rule. Raises ValueError for a malformed net."""
+        """Raises ValueError for a malformed net."""
         for what, names in (("place", self.places), ("transition", self.transitions)):
             if len(set(names)) != len(names):
                 twice = sorted({n for n in names if names.count(n) > 1})
@@ -186,12 +183,23 @@ class Net:
                 raise ValueError(
                     "an arc names an unknown place, names it twice or has a weight below 1"
                 )
-        compiled = CompiledNet.of(
+
+    @cached_property
+    def compiled(self) -> CompiledNet:
+        """The firing rule."""
+        return CompiledNet.of(
             self.consume, self.produce, self.inhibit, self.capacity, self.priority
         )
-        object.__setattr__(self, "compiled", compiled)
-        object.__setattr__(self, "place_index", {p: i for i, p in enumerate(self.places)})
-        object.__setattr__(self, "transition_index", {t: i for i, t in enumerate(self.transitions)})
+
+    @cached_property
+    def place_index(self) -> Mapping[str, int]:
+        """Index of each place."""
+        return {p: i for i, p in enumerate(self.places)}
+
+    @cached_property
+    def transition_index(self) -> Mapping[str, int]:
+        """Index of each transition."""
+        return {t: i for i, t in enumerate(self.transitions)}
 
     @classmethod
     def build(

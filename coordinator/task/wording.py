@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 from textwrap import wrap
+
+from msgspec import Struct
+from msgspec.structs import force_setattr
 
 from petrobot.services.host.toml_text import shortened
 
@@ -22,8 +24,7 @@ class Severity(StrEnum):
     ERROR = "error"
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(Struct, frozen=True):
     """One thing that is wrong: its key (`transitions.start.in`), a sentence, and the remedy."""
 
     key: str
@@ -31,7 +32,7 @@ class Fault:
     remedy: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "text", shortened(self.text))
+        force_setattr(self, "text", shortened(self.text))
 
     def __str__(self) -> str:
         return f"{self.key}: {self.text}" + (f"; {self.remedy}" if self.remedy else "")

@@ -7,8 +7,9 @@ themselves. That counts in its favour.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
+
+from msgspec import Struct
 
 
 class Edit(NamedTuple):
@@ -24,8 +25,7 @@ class Edit(NamedTuple):
 Edits = tuple[Edit, ...]
 
 
-@dataclass(frozen=True)
-class DesignFault:
+class DesignFault(Struct, frozen=True):
     """A design fault, and its edits in each program. None: the fault is impossible there."""
 
     name: str

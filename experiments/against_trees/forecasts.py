@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from experiments.against_trees.faults import Edit, Edits, apply
@@ -56,8 +56,7 @@ ARM = (*ALTERNATIVES["move_to_point"], "follow_and_wait", "empty_and_home", "res
 Samples = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class StructuralChange:
+class StructuralChange(Struct, frozen=True):
     """One change. `choices` by primitive task; `slow` and `faults` by action; `net` edits the task
     file."""
 
@@ -201,8 +200,7 @@ def by_petrobot(change: StructuralChange, train: Path, runs: int, out: Path) -> 
 # --- by hand --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Steps:
+class Steps(Struct, frozen=True):
     """The steps of the training trials, one row per trial; nan where a step did not run."""
 
     goal: Samples

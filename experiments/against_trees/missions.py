@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
+
+from msgspec import Struct, field
 
 from experiments.against_trees import plant
 from experiments.against_trees.cell import Make, play
@@ -25,8 +26,7 @@ takes about 45 s (a run that hangs, and resets)."""
 LIMIT_BALL = 10.0
 
 
-@dataclass
-class Mission:
+class Mission(Struct):
     """The result of a mission."""
 
     report: Report

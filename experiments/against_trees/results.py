@@ -6,10 +6,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
@@ -22,8 +23,7 @@ PROGRAMS = ("net", "tree", "machine")
 Line = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Size:
+class Size(Struct, frozen=True):
     """How much is measured. The training of the forecasts has 300 trials in both sizes, as a tenth
     of it would be another experiment."""
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.mobile.model import CameraModel
@@ -82,8 +82,7 @@ class FloorView:
         return np.where(inside, upper * (1.0 - dv) + lower * dv, np.nan).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class ScanGrid:
+class ScanGrid(Struct, frozen=True):
     """Where scan rows are sampled: distances `x` (rows,) and lateral positions `y` (columns,) in m,
     ascending."""
 
@@ -149,8 +148,7 @@ NARROWEST, WIDEST = 0.6, 2.1
 angle is wider."""
 
 
-@dataclass(frozen=True, slots=True)
-class Candidates:
+class Candidates(Struct, frozen=True):
     """Spots by row: `row` ascending, `y` (m), `strength` (grey levels), all (n,)."""
 
     row: NDArray[np.intp]

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from petrobot.services.mobile.track_map import Fit
 
@@ -22,8 +23,7 @@ def capped(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
-@dataclass(frozen=True, slots=True)
-class PurePursuit:
+class PurePursuit(Struct, frozen=True):
     """Drive the circle, tangent to the heading, that leads to the point of the line `distance` m
     away (R. C. Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992).
 
@@ -46,8 +46,7 @@ class PurePursuit:
         return capped(2.0 * fit.y / (x * x + fit.y * fit.y), TIGHTEST)
 
 
-@dataclass(frozen=True, slots=True)
-class FeedForward:
+class FeedForward(Struct, frozen=True):
     """The line's own curvature where the wheels will have responded, plus PD on the error at the
     axle.
 
@@ -85,8 +84,7 @@ LAWS: Final[Mapping[str, PurePursuit | FeedForward]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SpeedProfile:
+class SpeedProfile(Struct, frozen=True):
     """How fast to drive: as asked, slower in curves and towards the end of what is known."""
 
     sideways: float = 0.7

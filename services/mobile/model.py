@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any, Self
+
+from msgspec import Struct
 
 from petrobot.services.host.toml_text import TomlError, read_toml
 
@@ -18,8 +19,7 @@ class RoverFileError(ValueError):
     expected."""
 
 
-@dataclass(frozen=True)
-class _Table:
+class _Table(Struct, frozen=True):
     """A table of positive numbers; every field is a key of it."""
 
     @classmethod
@@ -30,13 +30,10 @@ class _Table:
             raise RoverFileError(
                 f"{source}: table [{name}] is missing; petrobot's own {NOMINAL} shows it"
             )
-        return cls(
-            **{field.name: _number(table, name, field.name, source) for field in fields(cls)}
-        )
+        return cls(**{key: _number(table, name, key, source) for key in cls.__struct_fields__})
 
 
-@dataclass(frozen=True)
-class FloorSizes(_Table):
+class FloorSizes(_Table, frozen=True):
     """The contest's floor (m)."""
 
     square: float
@@ -47,8 +44,7 @@ class FloorSizes(_Table):
     bar_width: float
 
 
-@dataclass(frozen=True)
-class Wheels(_Table):
+class Wheels(_Table, frozen=True):
     """The differential drive: m, rad/s and rad/s^2 of a wheel, s."""
 
     wheel_radius: float
@@ -59,8 +55,7 @@ class Wheels(_Table):
     wheel_lag: float
 
 
-@dataclass(frozen=True)
-class BusLayout(_Table):
+class BusLayout(_Table, frozen=True):
     """The CAN bus: period of SYNC (s) and node ids."""
 
     period: float
@@ -69,8 +64,7 @@ class BusLayout(_Table):
     sensor: float
 
 
-@dataclass(frozen=True)
-class CameraModel(_Table):
+class CameraModel(_Table, frozen=True):
     """The camera in front of the axle: m, rad down from the horizon, pixels, images/s."""
 
     forward: float
@@ -83,8 +77,7 @@ class CameraModel(_Table):
     principal_px: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Sensor(_Table):
+class Sensor(_Table, frozen=True):
     """The retroreflector sensor in front of the axle: m, s, rad to each side."""
 
     forward: float
@@ -94,8 +87,7 @@ class Sensor(_Table):
     range: float
 
 
-@dataclass(frozen=True)
-class RoverModel:
+class RoverModel(Struct, frozen=True):
     """All numbers of one rover."""
 
     track: FloorSizes

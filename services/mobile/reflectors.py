@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from petrobot.services.mobile.model import Sensor
 from petrobot.services.mobile.odometry import Pose
@@ -31,8 +32,7 @@ MOST: Final = 24
 """Most spots that are kept."""
 
 
-@dataclass(slots=True)
-class EchoSpot:
+class EchoSpot(Struct):
     """A spot that echoes came from: mean of the latest ones (m, odometry frame), their number, and
     when the last came (s)."""
 

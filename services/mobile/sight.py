@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
@@ -34,8 +34,7 @@ class TrackEnd(IntEnum):
     """The crossbar of the T."""
 
 
-@dataclass(frozen=True, slots=True)
-class LineEnd:
+class LineEnd(Struct, frozen=True):
     """Where (m, body frame at exposure) and how the line ends."""
 
     kind: TrackEnd
@@ -43,8 +42,7 @@ class LineEnd:
     y: float
 
 
-@dataclass(frozen=True, slots=True)
-class Sight:
+class Sight(Struct, frozen=True):
     """The line in one image, body frame at exposure: `x` ascending, `y` to the left (m); empty when
     none was seen.
 
@@ -98,8 +96,7 @@ class Sight:
 UNSEEN = Sight(np.empty(0), np.empty(0))
 
 
-@dataclass(frozen=True, slots=True)
-class Shape:
+class Shape(Struct, frozen=True):
     """The line at its nearest point: offset (m) and heading (rad) to the left, curvature (1/m,
     positive to the left)."""
 
@@ -108,8 +105,7 @@ class Shape:
     curvature: float
 
 
-@dataclass(frozen=True, slots=True)
-class Parabola:
+class Parabola(Struct, frozen=True):
     """A parabola y = offset + slope (x - near) + bend (x - near)^2 / 2 over [near, far] (m, body
     frame)."""
 
@@ -149,8 +145,7 @@ def polynomial(x: Vector, y: Vector, degree: int, weights: Vector | None = None)
     return solved
 
 
-@dataclass(frozen=True, slots=True)
-class TrackAhead:
+class TrackAhead(Struct, frozen=True):
     """A set point of the stream `track_ahead`: [age, confidence, end, end_x, end_y, x1, y1, x2, y2,
     ...].
 
@@ -162,7 +157,7 @@ class TrackAhead:
     age: float
     confidence: float
     end: LineEnd | None = None
-    points: tuple[tuple[float, float], ...] = field(default=())
+    points: tuple[tuple[float, float], ...] = ()
 
     def values(self) -> list[float]:
         """Return the set point as numbers."""

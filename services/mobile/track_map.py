@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.mobile.odometry import Pose
@@ -45,8 +45,7 @@ ENDS = 12
 """Sights of an end that are averaged."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(Struct, frozen=True):
     """The line near a place, in the body frame of a pose: y, slope and bend at that distance ahead
     (m, 1, 1/m)."""
 

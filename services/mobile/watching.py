@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.services.mobile.detection import FloorView, Grey, ScanGrid, TrackDetector
@@ -175,8 +176,7 @@ VOTES, NEEDED = 6, 3
 """Ends of the latest images that are counted, and how many must agree and outnumber the rest."""
 
 
-@dataclass(frozen=True)
-class FloorWatch:
+class FloorWatch(Struct, frozen=True):
     """What all watchers of one camera share: its geometry and scan rows."""
 
     view: FloorView

@@ -21,11 +21,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from operator import sub
 from typing import Any, Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.device import LIMITS, Driver, Ports, Setpoint, key

@@ -8,8 +8,9 @@ cycle it receives six target angles (rad) and reports what the drives report.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
@@ -65,8 +66,7 @@ _TPDO: Final = canopen.pdo_struct(SENT)
 _RPDO: Final = canopen.pdo_struct(RECEIVED)
 
 
-@dataclass(frozen=True, slots=True)
-class DriveSettings:
+class DriveSettings(Struct, frozen=True):
     """Configuration of one drive, in SI units."""
 
     lower: float

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.services.device import Setpoint
 from petrobot.services.motion.kinematics import ArmBranch, Puma
@@ -37,8 +38,7 @@ SLOWEST: Final = 1e-3
 """Speed towards the arm below which the ball does not arrive (m/s)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
+class Prediction(Struct, frozen=True):
     """Where (m), when (s from now) and how fast (m/s) the ball's centre leaves the table's near
     edge; base frame."""
 
@@ -77,8 +77,7 @@ class Prediction:
         return replace(self, point=(x, y * weight, z), velocity=(vx, vy * weight, vz))
 
 
-@dataclass(frozen=True, slots=True)
-class Strategy:
+class Strategy(Struct, frozen=True):
     """How to hold the cup.
 
     `tilt` of its axis from the vertical against the ball (rad); `depths` below the exit at which to
@@ -124,8 +123,7 @@ KEEP: Final = 0.03
 """Cost by which another candidate must be better than the present one."""
 
 
-@dataclass(frozen=True, slots=True)
-class CatchPlan:
+class CatchPlan(Struct, frozen=True):
     """A catching pose. Times are seconds from when the plan was made; `slack` is the time left
     over, negative if late."""
 

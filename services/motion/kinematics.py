@@ -10,10 +10,10 @@ matrix (..., 4, 4) in metres.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.motion.model import ArmModel, Vector
@@ -37,8 +37,7 @@ class ArmBranch(NamedTuple):
 BRANCHES = tuple(ArmBranch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1))
 
 
-@dataclass(frozen=True)
-class Puma:
+class Puma(Struct, frozen=True):
     """The arm's geometry for computation (m). `lower` and `upper` are the joint limits in radians,
     (6,) each."""
 

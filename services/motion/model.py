@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.host.toml_text import read_toml
@@ -26,8 +26,7 @@ class ArmFileError(ValueError):
     what was expected."""
 
 
-@dataclass(frozen=True)
-class Body:
+class Body(Struct, frozen=True):
     """Radii (m) of the capsules that stand for the solid parts of the arm."""
 
     base: float
@@ -35,8 +34,7 @@ class Body:
     wrist: float
 
 
-@dataclass(frozen=True)
-class ArmModel:
+class ArmModel(Struct, frozen=True):
     """Geometry and limits of the arm. Arrays have one entry per joint, base to flange; SI units,
     radians."""
 
@@ -51,8 +49,7 @@ class ArmModel:
     poses: Mapping[str, tuple[float, ...]]
 
 
-@dataclass(frozen=True)
-class Cup:
+class Cup(Struct, frozen=True):
     """The cup and its mount on the flange.
 
     `mouth` (m) is the centre of its opening and `axis` (unit vector) points out of it, both in
@@ -66,8 +63,7 @@ class Cup:
     wall: float
 
 
-@dataclass(frozen=True)
-class CatchingCell:
+class CatchingCell(Struct, frozen=True):
     """What motion needs of the cell: cup, table (m, base frame) and ball (m, m/s^2)."""
 
     cup: Cup

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import msgpack
+from msgspec import Struct
 
 from petrobot.services.action import Result, error, failure, success
 from petrobot.services.comm.location_file import MEMORY_CALLS
@@ -25,8 +25,7 @@ def event_name(variable: str) -> str:
     return f"memory:{variable}"
 
 
-@dataclass(frozen=True, slots=True)
-class StoredValue:
+class StoredValue(Struct, frozen=True):
     """A value, its version (1 after the first write), and its size in bytes."""
 
     value: Any

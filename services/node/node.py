@@ -3,14 +3,17 @@ runs, its memory, timers and calls."""
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import (
@@ -182,8 +185,7 @@ MISSED = (
 """Why a device is refused to a caller that does not know of a stop."""
 
 
-@dataclass
-class _Commanded:
+class _Commanded(Struct):
     """An operator's command that has not been answered: the answers so far, and the hosts whose
     answers are missing."""
 
@@ -643,7 +645,7 @@ class Node:
         self._now = now
         result = self.memory.call(call.service, call.arguments)
         executed = Executed.NO if result.status is Status.ERROR else Executed.YES
-        return outcome_of(call.id, replace(result, executed=executed))
+        return outcome_of(call.id, dataclasses.replace(result, executed=executed))
 
     def _memory_changed(self, name: str, value: Any, version: int) -> None:
         data = {"name": name, "value": value, "version": version}

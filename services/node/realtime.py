@@ -10,8 +10,9 @@ import secrets
 import signal
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import Order

@@ -13,9 +13,10 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any
+
+from msgspec import Struct
 
 from petrobot.services.action import Status
 from petrobot.services.comm.protocol.messages import (
@@ -133,8 +134,7 @@ STARTING = (HostStage.DRIVER_STARTS, HostStage.ACTIONS_START)
 _TAKES_RUNS = HostStage.READY  # looked up once, see `runner.NEW`
 
 
-@dataclass(slots=True)
-class _HostedCall:
+class _HostedCall(Struct):
     """A call that the host has. The node's `Callee` watches its deadline."""
 
     call: Call
@@ -157,8 +157,7 @@ class _HostedCall:
 Spawn = Callable[[Setup, Callable[[Child, list[Item]], None], Callable[[Child], None], Any], Child]
 
 
-@dataclass(frozen=True, slots=True)
-class Hosting:
+class Hosting(Struct, frozen=True):
     """What a node gives to a `WorkerHost` or to a `WorkerPool` of them."""
 
     setup: Setup

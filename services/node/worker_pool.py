@@ -11,8 +11,10 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from functools import partial
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.services.action import Status
 from petrobot.services.comm.protocol.messages import (
@@ -43,8 +45,7 @@ IDLE_LIMIT = 30.0
 """Time after which any further idle worker exits (s)."""
 
 
-@dataclass
-class _GatheredCommand:
+class _GatheredCommand(Struct):
     """A command that several workers carry out."""
 
     verb: str

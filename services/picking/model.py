@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.services.host.toml_text import TomlError, read_toml
 from petrobot.services.joint_chain import JointChain, rotation_matrix, rotation_vector
@@ -28,8 +28,7 @@ class OutOfReachError(ValueError):
     """The arm cannot bring its fingers there."""
 
 
-@dataclass(frozen=True, slots=True)
-class PartKind:
+class PartKind(Struct, frozen=True):
     """A kind of part: `size` (length, width) and `height` in m; the diameter of a round one is
     both."""
 
@@ -40,8 +39,7 @@ class PartKind:
     tray: str
 
 
-@dataclass(frozen=True, slots=True)
-class OverheadCamera:
+class OverheadCamera(Struct, frozen=True):
     """The camera: straight above the table, its image's u along -y and v along -x."""
 
     width: int
@@ -67,8 +65,7 @@ class OverheadCamera:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Tray:
+class Tray(Struct, frozen=True):
     """A tray: its middle, its size along x and y, and its slots in the order of filling (m)."""
 
     position: tuple[float, float]
@@ -76,8 +73,7 @@ class Tray:
     slots: tuple[tuple[float, float], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class PickingCell:
+class PickingCell(Struct, frozen=True):
     """The cell, as far as its services know it."""
 
     eye: OverheadCamera
@@ -87,8 +83,7 @@ class PickingCell:
     trays: Mapping[str, Tray]
 
 
-@dataclass(frozen=True, slots=True)
-class Gripper:
+class Gripper(Struct, frozen=True):
     """Two parallel fingers (m). `numbers`: further numbers for the arm's driver."""
 
     opening: float
@@ -97,8 +92,7 @@ class Gripper:
     numbers: Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True)
-class ArmNumbers:
+class ArmNumbers(Struct, frozen=True):
     """An arm on the table."""
 
     name: str

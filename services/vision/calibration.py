@@ -12,12 +12,12 @@ hand-eye routine is needed, which OpenCV 5 no longer has. Pure: images in, calib
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.host.toml_text import TomlError, read_toml
@@ -51,8 +51,7 @@ class CalibrationError(ValueError):
     """The images do not determine a calibration; the message says why and what to do."""
 
 
-@dataclass(frozen=True, slots=True)
-class Board:
+class Board(Struct, frozen=True):
     """A chessboard of `columns` x `rows` inner corners with squares of `square` m.
 
     Origin of its frame: the first corner, beside the black square that touches the printed corner
@@ -72,8 +71,7 @@ class Board:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class BoardView:
+class BoardView(Struct, frozen=True):
     """One image of the board, grey levels (height, width); `pose` (4, 4) from board frame to base
     frame, None where unknown; `name` that of its file."""
 
@@ -82,8 +80,7 @@ class BoardView:
     name: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Calibration:
+class Calibration(Struct, frozen=True):
     """A calibrated camera and how accurately it is known."""
 
     optics: Optics

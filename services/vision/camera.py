@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.services.action import Context
 from petrobot.services.camera import CameraDriver
@@ -29,8 +29,7 @@ MOST_SHOWN = 8
 """Most candidates that are drawn over an image."""
 
 
-@dataclass(frozen=True, slots=True)
-class Mark:
+class Mark(Struct, frozen=True):
     """What an action saw in an image, for the operator: `pixels` of shape (n, 2), or `table`
     positions in m for what it predicts."""
 

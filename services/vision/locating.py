@@ -9,10 +9,11 @@ edge.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.action import (
@@ -35,8 +36,7 @@ from petrobot.services.vision.specification import Specification
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class BallTrack:
+class BallTrack(Struct, frozen=True):
     """A ball that was seen to roll.
 
     `times` (n,) s, `places` (n, 2) m, and the `residual` (m, rms) of the places about the straight
@@ -152,8 +152,7 @@ LEARN_EVERY = 10
 """The stored background learns from every tenth image."""
 
 
-@dataclass(frozen=True, slots=True)
-class LocateSpecification(Specification):
+class LocateSpecification(Specification, frozen=True):
     """When a ball counts as located, and how accurately (s, m)."""
 
     timeout: float = 5.0

@@ -9,11 +9,11 @@ pixel centres.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -24,8 +24,7 @@ NEWTON_STEPS = 4
 (tests/vision/test_optics.py)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Optics:
+class Optics(Struct, frozen=True):
     """A calibrated camera.
 
     `focal` and `centre` (px), `distortion` k1 k2 p1 p2, and its pose: a base-frame point p has
@@ -124,8 +123,7 @@ class Optics:
 # --- the table ---
 
 
-@dataclass(frozen=True)
-class TableView:
+class TableView(Struct, frozen=True, dict=True):
     """Table and ball (m, base frame) in front of a calibrated camera. `height` is that of a rolling
     ball's centre."""
 

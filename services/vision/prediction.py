@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -40,8 +40,7 @@ class ExitWay(StrEnum):
     """It stops before an edge, or rolls away from the near one."""
 
 
-@dataclass(frozen=True, slots=True)
-class PredictedExit:
+class PredictedExit(Struct, frozen=True):
     """Prediction of where the ball's centre passes the edge.
 
     `time` on the clock of the observations, `point` and `velocity` (2,), standard deviations of the
@@ -56,8 +55,7 @@ class PredictedExit:
     sigma_place: float
 
 
-@dataclass(frozen=True, slots=True)
-class Surface:
+class Surface(Struct, frozen=True):
     """The table as the ball's centre meets it, and how it slows the ball.
 
     `rolling` and `rolling_sigma`: deceleration of a rolling ball and its uncertainty (m/s^2);

@@ -5,18 +5,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from typing import Any, Self
 
+from msgspec import Struct
 
-@dataclass(frozen=True, slots=True)
-class Specification:
+
+class Specification(Struct, frozen=True):
     """Base class of an action's options; subclasses declare float fields with defaults."""
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> Self:
         """Return the options given as keyword arguments. Raises ValueError naming the option."""
-        known = [field.name for field in fields(cls)]
+        known = cls.__struct_fields__
         for name, value in options.items():
             if name not in known:
                 raise ValueError(f"unknown option {name!r}; the options are {', '.join(known)}")

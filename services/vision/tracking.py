@@ -4,7 +4,6 @@ will leave the table."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,8 +34,7 @@ Predictions = Sequence[tuple[float, float, float]]
 """When each was made, and when (s) and where (y, m) the ball will leave by it."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackSpecification(Specification):
+class TrackSpecification(Specification, frozen=True):
     """When a tracked ball was predicted well enough, and when it is lost (s, m)."""
 
     rate: float = 0.0

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
+
+from msgspec.structs import replace
 
 from petrobot.services.action import CallFailed, CommandRefused, Result, Status, Wait
 from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
@@ -349,5 +351,5 @@ class RunContext:
         if outcome.id not in self._waiting:
             return False
         # A verdict on a provisional answer names the run that gave it, never this one.
-        self._answers[outcome.id] = replace(result_of(outcome), deferred=False)
+        self._answers[outcome.id] = dataclasses.replace(result_of(outcome), deferred=False)
         return True

@@ -23,7 +23,6 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
 from itertools import islice
 from operator import attrgetter
 from pathlib import Path
@@ -31,6 +30,9 @@ from pathlib import Path
 # Its own name, as in `runner`.
 from time import monotonic
 from typing import Any, NamedTuple
+
+from msgspec import Struct, field
+from msgspec.structs import asdict
 
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
 from petrobot.services.comm.protocol.messages import (
@@ -85,8 +87,7 @@ _log = logging.getLogger(__name__)
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-@dataclass(frozen=True, slots=True)
-class Setup:
+class Setup(Struct, frozen=True):
     """First message of the node to a new process."""
 
     source: str

@@ -6,9 +6,10 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
+
+from msgspec import Struct, field
 
 from petrobot.services.comm.protocol.messages import EMERGENCY_STOP as EMERGENCY_STOP, SEED
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
@@ -35,8 +36,7 @@ class DeviceError(Exception):
     device was stopped if that was possible."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceCommand:
+class DeviceCommand(Struct, frozen=True):
     """A command of an action, or the stop routine."""
 
     number: int
@@ -45,8 +45,7 @@ class DeviceCommand:
     body: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(slots=True)  # one is made in each cycle, and a frozen one takes three times as long
-class DeviceState:
+class DeviceState(Struct):
     """What the driver's end publishes at each cycle; only the newest one counts."""
 
     handled: int = 0

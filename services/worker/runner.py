@@ -10,13 +10,15 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, replace
 from enum import Enum, auto
 from math import inf
 
 # Its own name: a test's clock that an action leaves in `time` must not reach later runs.
 from time import process_time
 from typing import Any, Protocol
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.services.action import Cancelled, CommandRefused, Status, Wait
 from petrobot.services.comm.location_file import ActionEntry, resolve
@@ -98,8 +100,7 @@ class Returned(Exception):  # noqa: N818 - not an error
         self.value = value
 
 
-@dataclass(eq=False)
-class Execution:
+class Execution(Struct, eq=False):
     """State of one run; times in seconds on the cell's clock."""
 
     call: Call

@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.codec import LIMITS
@@ -79,8 +80,7 @@ MOST = (LIMITS[SetPoint.KIND] - 64) // 9
 """Most numbers of a set point: each takes 9 bytes of its message."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
+class Sent(Struct, frozen=True):
     """A set point to send: the newest value of a stream, how long ago its action published it (s),
     and how long ago its run began (s)."""
 
@@ -91,8 +91,7 @@ class Sent:
     age: float
 
 
-@dataclass
-class _Outlet:
+class _Outlet(Struct):
     period: float
     run: str = ""
     began: float = 0.0

@@ -6,11 +6,12 @@ from __future__ import annotations
 import configparser
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from operator import itemgetter
 from typing import Final
+
+from msgspec import Struct
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import (
@@ -45,8 +46,7 @@ _PREDEFINED: Final = range(0x080, 0x100)
 _SYNCHRONOUS: Final = range(241)
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(Struct, frozen=True):
     """One object of the dictionary."""
 
     type: DataType

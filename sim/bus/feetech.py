@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 STEPS: Final = 4096
 """Positions of one turn of the shaft."""
@@ -59,8 +60,7 @@ def unsigned(value: float, bit: int) -> int:
     return whole | (value < 0 and whole > 0) << bit
 
 
-@dataclass
-class Servo:
+class Servo(Struct):
     """One servo. What the world does to it is `external`, `low`, `high`; what it does to the world
     is `angle` and `torque`."""
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+from msgspec import Struct
 
 
 class BallState(NamedTuple):
@@ -24,8 +25,7 @@ class BallState(NamedTuple):
     spin: tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class BallModel:
+class BallModel(Struct, frozen=True):
     """Constants of the ball for all throws; `inertia_factor` is k = I / (m r^2), `friction` the
     sliding coefficient."""
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
 from petrobot.sim.catching.scenery import (
@@ -49,8 +49,7 @@ LENS_STEPS = 6
 """Steps of the fixed-point inverse of the distortion."""
 
 
-@dataclass(frozen=True, slots=True)
-class CameraView:
+class CameraView(Struct, frozen=True):
     """True pose, lens and light of the camera, where they differ from the cell's nominal ones.
     None: nominal."""
 
@@ -80,10 +79,11 @@ class CameraView:
     @classmethod
     def of(cls, truth: Mapping[str, Any]) -> CameraView:
         """Read a mapping with these names as keys. Raises ValueError for an unknown key."""
-        unknown = sorted(set(truth) - set(cls.__slots__))
+        known = cls.__struct_fields__
+        unknown = sorted(set(truth) - set(known))
         if unknown:
             raise ValueError(
-                f"camera truth: unknown key {unknown[0]!r}; known are {', '.join(cls.__slots__)}"
+                f"camera truth: unknown key {unknown[0]!r}; known are {', '.join(known)}"
             )
         return cls(**truth)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Protocol
+
+from msgspec import Struct
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import NmtState
@@ -27,8 +28,7 @@ from petrobot.sim.bus.power_drive import ENABLE, ENABLE_MASK, POWERED, RUNNING, 
 # --- the position loop of one drive ---
 
 
-@dataclass(frozen=True, slots=True)
-class DriveRating:
+class DriveRating(Struct, frozen=True):
     """What a drive was sized and commissioned for, at the joint: torque (N m), speed (rad/s),
     expected inertia (kg m^2)."""
 

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.sim.catching.ball import BallModel
 from petrobot.sim.catching.puma_model import PumaModel
@@ -42,8 +42,7 @@ _PLACE = 1e-3
 """Distance and angle within which a pose counts as found (m, rad)."""
 
 
-@dataclass(frozen=True, slots=True)
-class OracleVerdict:
+class OracleVerdict(Struct, frozen=True):
     """`margin` (s) is how much earlier than the ball the cup can be there, at best; negative: too
     late; -inf: no pose."""
 

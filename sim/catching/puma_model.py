@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.sim.catching.truth import LaboratoryError, Vector, read_toml
 
@@ -78,8 +78,7 @@ def twist(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class PrincipalInertia:
+class PrincipalInertia(Struct, frozen=True):
     """Mass (kg), centre of mass (m) and principal inertia about it (kg m^2) in the link's own DH
     frame."""
 
@@ -108,8 +107,7 @@ def real_inertia(inertia: tuple[float, float, float]) -> tuple[float, float, flo
     return mended[0], mended[1], mended[2]
 
 
-@dataclass(frozen=True, slots=True)
-class PumaModel:
+class PumaModel(Struct, frozen=True):
     """One entry per joint, base to flange. `rotor`, `viscous`, `coulomb` are converted to the joint
     (kg m^2, N m s/rad, N m)."""
 

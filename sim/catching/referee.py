@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from petrobot.sim.catching.oracle import Oracle, OracleVerdict
 from petrobot.sim.catching.thrower import ThrowCourse, ThrowOutcome
@@ -47,8 +48,7 @@ MOST_ROWS: Final = 2_500
 """Most throws of which one answer tells the details; no message carries 2,900."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
+class _Entry(Struct, frozen=True):
     course: ThrowCourse
     verdict: OracleVerdict
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 # --- static ---
@@ -40,8 +40,7 @@ MARKS = ((0.25, 0.22), (0.25, -0.30), (0.80, 0.36), (0.80, -0.20), (1.30, 0.28),
 detector that looks for circles."""
 
 
-@dataclass(frozen=True, slots=True)
-class TableArea:
+class TableArea(Struct, frozen=True):
     """The table of the cell: height of its top, x of the near edge, length along x, width along y
     (m)."""
 
@@ -93,8 +92,7 @@ def floor_grey(x: Array, y: Array) -> Array:
     return np.where(joint, FLOOR_JOINT_GREY, tiles)
 
 
-@dataclass(frozen=True, slots=True)
-class Chessboard:
+class Chessboard(Struct, frozen=True):
     """A calibration board: `columns` x `rows` inner corners, `square` m wide, with a white margin
     of one square.
 
@@ -196,8 +194,7 @@ class Lens(Protocol):
         """Return pixels (..., 2) of points (..., 3)."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Cover:
+class Cover(Struct, frozen=True, eq=False):
     """A patch that hides the scene: convex hull (n, 1, 2) in sixteenths of a pixel, the box of the
     image that contains it, its grey level, its height (m)."""
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.host.numba_kernels import kernel, packed
@@ -92,8 +93,7 @@ def numbers_of(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Site:
+class Site(Struct, frozen=True):
     """The nominal data of the laboratory. `laboratory` is the file of errors, regimes and
     disturbances."""
 

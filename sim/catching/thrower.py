@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.sim.catching.ball import BallModel, BallState
 from petrobot.sim.catching.truth import Truth
@@ -20,8 +20,7 @@ from petrobot.sim.catching.truth import Truth
 _STREAM = 0x7468  # Keeps the thrower's draws separate from other draws of the same seed.
 
 
-@dataclass(frozen=True, slots=True)
-class Throw:
+class Throw(Struct, frozen=True):
     """One throw: `speed` (m/s) and `start` at release, the point at which it is aimed (`exit_y`,
     m), and the resistance that the ball meets."""
 
@@ -110,8 +109,7 @@ class ThrowOutcome(StrEnum):
     """It was in the cup and left it while the cup stood upright."""
 
 
-@dataclass(slots=True)
-class ThrowCourse:
+class ThrowCourse(Struct):
     """What was seen of one throw so far. Times are seconds after its release, lengths m, base
     frame."""
 
@@ -139,14 +137,13 @@ class ThrowCourse:
         return self.crossing if self.crossing < math.inf else self.approach
 
 
-@dataclass(slots=True)
-class LightBarrier:
+class LightBarrier(Struct):
     """A light barrier with a filter: its output follows the beam after `delay` seconds without a
     change."""
 
     delay: float
     output: bool = False
-    _since: float = field(default=0.0)
+    _since: float = 0.0
 
     def see(self, now: float, interrupted: bool) -> None:
         """Set the state of the beam at `now` (s); call it at least once per tick."""

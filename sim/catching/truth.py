@@ -9,11 +9,11 @@ Only the laboratory reads this. A regime name is a regime and any number of dist
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.host import toml_text
@@ -28,8 +28,7 @@ class LaboratoryError(ValueError):
     remedy."""
 
 
-@dataclass(frozen=True, slots=True)
-class CameraTruth:
+class CameraTruth(Struct, frozen=True):
     """The camera as it is really mounted: a point p (base frame, m) has camera coordinates
     `rotation @ (p - position)`."""
 
@@ -43,8 +42,7 @@ class CameraTruth:
     """k1 k2 p1 p2 in OpenCV's order and sense."""
 
 
-@dataclass(frozen=True, slots=True)
-class CupTruth:
+class CupTruth(Struct, frozen=True):
     """The cup as it is really mounted, in the flange frame (frame 6 of the arm)."""
 
     mouth: Vector
@@ -56,8 +54,7 @@ class CupTruth:
     restitution: float
 
 
-@dataclass(frozen=True, slots=True)
-class TableTruth:
+class TableTruth(Struct, frozen=True):
     """The table as it really stands: top at height `top`, x from `near_edge` to `far_edge`, |y| <=
     `half_width` (m)."""
 
@@ -67,8 +64,7 @@ class TableTruth:
     half_width: float
 
 
-@dataclass(frozen=True, slots=True)
-class Scatter:
+class Scatter(Struct, frozen=True):
     """What differs from image to image, frame to frame and ball to ball; the laboratory file
     explains each ([nominal])."""
 
@@ -88,8 +84,7 @@ class Scatter:
         return self.table_slope == (0.0, 0.0) and self.wave_slope == 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(Struct, frozen=True):
     """The simulated truth of one regime: everything that services must not know."""
 
     regime: str
@@ -320,12 +315,10 @@ def _cup(
 
 def _scatter(values: Mapping[str, Any]) -> Scatter:
     """Return what scatters; a laboratory file that is older than these keys has none of it."""
-    found: dict[str, Any] = {
-        one.name: values[one.name] for one in fields(Scatter) if one.name in values
-    }
     given: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else float(value)
-        for key, value in found.items()
+        key: tuple(values[key]) if isinstance(values[key], list) else float(values[key])
+        for key in Scatter.__struct_fields__
+        if key in values
     }
     return Scatter(**given)
 

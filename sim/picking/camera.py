@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
 import cv2
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.sim.picking.parts import Part, Point, rectangle
@@ -23,8 +23,7 @@ _SIDE: Final = 0.72
 """Brightness of a part's sides relative to its top."""
 
 
-@dataclass(frozen=True, slots=True)
-class Lighting:
+class Lighting(Struct, frozen=True):
     """Lighting on the table: its level, the direction (rad) and length of shadows per height, their
     darkness, and a broad shadow across the table (position along y and width; m)."""
 
@@ -37,8 +36,7 @@ class Lighting:
     """Standard deviation of the noise (grey levels)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Mounted:
+class Mounted(Struct, frozen=True):
     """The camera as it is really mounted: a point p has camera coordinates `rotation @ (p -
     position)`."""
 

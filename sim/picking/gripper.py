@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.sim.picking.parts import Part, Point, clipped
@@ -138,8 +138,7 @@ _TURNS: Final = 24
 _LARGEST_TURN: Final = math.radians(2.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Fingers:
+class Fingers(Struct, frozen=True):
     """Sizes of a gripper (m): greatest gap, and a finger's size along and across the closing
     direction."""
 

@@ -7,11 +7,11 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
 import numpy as np
+from msgspec import Struct
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
@@ -160,8 +160,7 @@ _AWAY: Final = 0.12
 """Distance from a tray's middle at which the fingers are safe for the person's hands (m)."""
 
 
-@dataclass(slots=True)
-class _Delivery:
+class _Delivery(Struct):
     """A part that was put into a tray: when (s), and whether the tray was the right one."""
 
     time: float

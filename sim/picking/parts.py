@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Final, NamedTuple
+
+from msgspec import Struct, field
 
 Point = tuple[float, float]
 CORNERS: Final = 24
@@ -26,8 +27,7 @@ class Contact(NamedTuple):
     point: Point
 
 
-@dataclass(slots=True)
-class Part:
+class Part(Struct):
     """A part: its true size (m), mass (kg), friction coefficient at the fingers, and pose."""
 
     number: int

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.sim.catching.truth import LaboratoryError, disturbed, read_toml
@@ -27,8 +27,7 @@ _DRAWS: Final = 1500
 """Most random positions that are tried for the parts of an experiment."""
 
 
-@dataclass(frozen=True, slots=True)
-class PickingTruth:
+class PickingTruth(Struct, frozen=True):
     """The values of one regime, as `[nominal]` of the laboratory file names them."""
 
     parts: int
@@ -52,8 +51,7 @@ class PickingTruth:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class PickingSite:
+class PickingSite(Struct, frozen=True):
     """The files of the cell: what its services know (`cell`, `numbers` of the arm), and the
     truth."""
 

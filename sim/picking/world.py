@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.sim.picking.gripper import FULL_DEPTH, Fingers, ToolPose, close_on
 from petrobot.sim.picking.parts import Part, contact, rectangle, within
@@ -45,8 +45,7 @@ class Held(NamedTuple):
     firmness: float
 
 
-@dataclass(slots=True)
-class TableTop:
+class TableTop(Struct):
     """The edges of the table: x from, to, y from, to (m)."""
 
     x: tuple[float, float]

@@ -9,11 +9,11 @@ floor's pictures: one matrix for the whole image.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from msgspec import Struct
 from numpy.typing import ArrayLike, NDArray
 
 from petrobot.sim.track.floor import COARSE, FINE, Floor, FloorWindow, Picture
@@ -35,8 +35,7 @@ _SAMPLING: Final = 3.0
 used."""
 
 
-@dataclass(frozen=True, slots=True)
-class Mount:
+class Mount(Struct, frozen=True):
     """Where the camera is on the rover (m, rad) and its lens (px): pitch down, yaw to the left,
     roll to the right."""
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from petrobot.sim.track.course import BOARD, SQUARE, FloorPose, Gap, Near, Track
 
@@ -51,8 +52,7 @@ class RunPhase(StrEnum):
     END = "end"
 
 
-@dataclass(slots=True)
-class _Crossing:
+class _Crossing(Struct):
     """What happened at one interruption. `aside` is the greatest distance from the line that is
     missing there (m)."""
 
@@ -65,8 +65,7 @@ class _Crossing:
     aside: float = 0.0
 
 
-@dataclass(slots=True)
-class TrackReferee:
+class TrackReferee(Struct):
     """Watches one run. Call `watch` often; `score` returns plain data at any time."""
 
     track: Track

@@ -8,11 +8,11 @@ Only the laboratory reads this. A regime name is a kind of track and any number 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.sim.catching.truth import LaboratoryError, disturbed, read_toml
@@ -22,16 +22,14 @@ from petrobot.sim.track.course import Track
 LABORATORY_FILE = Path(__file__).with_name("track.toml")
 
 
-@dataclass(frozen=True, slots=True)
-class WheelTruth:
+class WheelTruth(Struct, frozen=True):
     """The true values of one wheel and its motor."""
 
     radius: float
     lag: float
 
 
-@dataclass(frozen=True, slots=True)
-class RoverTruth:
+class RoverTruth(Struct, frozen=True):
     """The true values of the rover; sim/track/track.toml and rover.toml explain the numbers."""
 
     wheels: tuple[WheelTruth, WheelTruth]
@@ -52,8 +50,7 @@ class RoverTruth:
     """How it is put down, friction, inertia, brakes, torque, electronics."""
 
 
-@dataclass(frozen=True, slots=True)
-class SensorTruth:
+class SensorTruth(Struct, frozen=True):
     """The true values of the retroreflector sensor (m, rad)."""
 
     forward: float
@@ -72,8 +69,7 @@ class SensorTruth:
     false_range: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class LightTruth:
+class LightTruth(Struct, frozen=True):
     """Light over the floor, flashes, and the camera's noise as a factor on the nominal one."""
 
     level: float
@@ -86,8 +82,7 @@ class LightTruth:
     noise: float
 
 
-@dataclass(frozen=True, slots=True)
-class TrackCourse:
+class TrackCourse(Struct, frozen=True):
     """The kind of track that a regime uses."""
 
     kinds: str
@@ -108,8 +103,7 @@ class TrackCourse:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class TrackTruth:
+class TrackTruth(Struct, frozen=True):
     """The simulated truth of one regime."""
 
     regime: str
@@ -122,8 +116,7 @@ class TrackTruth:
     """Probability that a reflector has fallen down."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackSite:
+class TrackSite(Struct, frozen=True):
     """The two files of the cell."""
 
     nominal: Mapping[str, Any]

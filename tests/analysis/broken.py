@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.graph import STEPS
 from petrobot.coordinator.analysis.net.space import SearchLimits

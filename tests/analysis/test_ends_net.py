@@ -6,11 +6,11 @@ from __future__ import annotations
 import tracemalloc
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph, TooManyValues, execute
 from petrobot.coordinator.analysis.execution.names import MISSING

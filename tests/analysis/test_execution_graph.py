@@ -5,12 +5,13 @@ beginning, and the engine reports it."""
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field, replace
 from itertools import cycle
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, assume, event, find, given, settings, strategies as st
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.causes import explain, settled
 from petrobot.coordinator.analysis.execution.chain import TooLarge, chain_of
@@ -77,7 +78,7 @@ def moved(net: Task, **changes: object) -> Task:
     made: dict[str, object] = {}
     for key, new in changes.items():
         made[key] = {**getattr(net, key), **{one.name: one for one in new}}  # type: ignore[attr-defined]
-    return replace(net, **made)  # type: ignore[arg-type]
+    return replace(net, **made)
 
 
 BODY = """schema = 1
@@ -322,8 +323,7 @@ VALUES: dict[VariableType, st.SearchStrategy[object]] = {
 }
 
 
-@dataclass
-class Player:
+class Player(Struct):
     """The world: answers every instruction, raises events, and lets timers elapse by a clock."""
 
     engine: Engine

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution import graph
 from petrobot.coordinator.analysis.execution.chain import chain_of
@@ -53,8 +54,7 @@ def codes(task: Task) -> set[str]:
     return {finding.code for finding in may_run(task, None, Budget()).report.findings}
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(Struct, frozen=True):
     """A small task that gets stuck, and the words that must describe its dead end."""
 
     places: str

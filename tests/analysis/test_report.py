@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import count, product
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.commands import (
     analyse_command,

@@ -5,13 +5,14 @@ Markov chain, and in missions that the engine plays by a clock."""
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
 from math import exp, log, sqrt
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import assume, event, example, given, settings, strategies as st
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
 from petrobot.coordinator.analysis.execution.chain import (
@@ -80,8 +81,7 @@ def arcs(name: str, take: str, give: str, more: str = "") -> str:
     return "{} = {{ in = [{}], out = [{}]{} }}\n".format(name, *quoted, more)
 
 
-@dataclass
-class Text:
+class Text(Struct):
     """A task file in the making."""
 
     parts: int = 1

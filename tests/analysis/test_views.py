@@ -3,7 +3,6 @@ tasks."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import exp, log
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.chain import chain_of
 from petrobot.coordinator.analysis.execution.progress import progress_of

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
 from petrobot.coordinator.analysis.formats.netfile import NetFileError

@@ -10,10 +10,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis import may_run, report
 from petrobot.coordinator.analysis.execution.graph import Shared

@@ -715,7 +715,7 @@ def test_a_task_may_name_its_own_location_file(
 def test_a_task_may_draw_its_own_pictures() -> None:
     """`pictures` of the task file names a function that draws a result for the report. A function
     that does not exist is an error."""
-    from dataclasses import replace
+    from msgspec.structs import replace
 
     from petrobot.coordinator.cli import CommandError
     from petrobot.coordinator.cli.loading import SHIPPED, pictures_of

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import (

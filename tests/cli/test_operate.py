@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.cli import COMMANDS, CommandError, main
+from petrobot.coordinator.cli import COMMANDS, main
 from petrobot.coordinator.cli.options import recorded
 from petrobot.coordinator.cli.resume import later_run, located
 from petrobot.coordinator.engine import Mode
@@ -676,7 +676,7 @@ def test_the_run_of_another_user_is_not_said_to_be_interrupted(
             for name in (None, "theirs"):
                 with pytest.raises(NoRunError, match="theirs was started by another user"):
                     find_address(name, runs)
-            with pytest.raises(CommandError, match="theirs was started by another user, who"):
+            with pytest.raises(JournalError, match="theirs was started by another user, who"):
                 recorded("last")
         finally:
             os.seteuid(me)

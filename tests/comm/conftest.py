@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import AsyncIterator, Callable, Iterable
 from typing import Any, get_args
 
@@ -53,7 +52,7 @@ def messages_of(kinds: Iterable[type[Any]]) -> st.SearchStrategy[Any]:
     return st.one_of(
         [
             st.builds(
-                cls, **{field.name: _FIELDS[str(field.type)] for field in dataclasses.fields(cls)}
+                cls, **{name: _FIELDS[cls.__annotations__[name]] for name in cls.__struct_fields__}
             )
             for cls in kinds
         ]

@@ -3,10 +3,9 @@ refuses, which results it keeps, and when it stops a run."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 from hypothesis import given, strategies as st
+from msgspec.structs import replace
 
 from petrobot.services.comm.calls.callee import (
     Callee,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.services.comm.calls.caller import Caller, LateResult, Notice, PeerLost
 from petrobot.services.comm.protocol import messages as m

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from dataclasses import dataclass, field, replace
 
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.services.comm.calls.callee import Callee, Offer, Retention
 from petrobot.services.comm.calls.caller import Caller, LateResult
@@ -19,14 +20,12 @@ COORD = "coord"
 DEVICES = 2
 
 
-@dataclass
-class ModelRun:
+class ModelRun(Struct):
     ends: float
     call: m.Call
 
 
-@dataclass
-class World:
+class World(Struct, dict=True):
     """A coordinator with a journal, a node that runs the actions ordered, and a link between
     them."""
 

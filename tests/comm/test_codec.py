@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -10,6 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 from hypothesis import example, given, strategies as st
+from msgspec.structs import replace
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.party import Envelope, Posted
@@ -385,7 +385,7 @@ def test_a_result_may_have_more_values_than_a_call() -> None:
     long = m.Outcome("c", "success", {"v": [1] * 500_000}, "", "", Executed.YES, 0.0, 0.0)
     assert decode(encode(long)) == long
     with pytest.raises(ProtocolError, match=r"too_large: Outcome: more than 524288 values"):
-        encode(dataclasses.replace(long, values={"v": [1] * 600_000}))
+        encode(replace(long, values={"v": [1] * 600_000}))
 
 
 def test_a_value_of_the_global_memory_fits() -> None:

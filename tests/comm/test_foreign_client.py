@@ -14,11 +14,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import Struct
 
 from tests.comm import foreign as f
 from tests.comm.foreign import Foreign, pack
@@ -53,8 +53,7 @@ nap = {{ run = "toy_cell.actions:nap", task = "sum", node = "hub" }}
 """
 
 
-@dataclass
-class Hub:
+class Hub(Struct):
     """A node process."""
 
     address: tuple[str, int]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from pathlib import Path
 
@@ -31,16 +30,12 @@ CODE = "\n".join(path.read_text(encoding="utf-8") for path in sorted(SERVICES.rg
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_the_table_of_messages(kind: type[m.Message]) -> None:
     row = ROWS[kind.KIND]
-    fields = [field.name for field in dataclasses.fields(kind)]
+    fields = list(kind.__struct_fields__)
     assert (
         re.findall(r"(\w+) (?:str|int|dur|bool|bytes|map|\*text\*|\[\w+\])(?=[ ,)]|$)", row[5])
         == fields
     )
-    required = [
-        field.name
-        for field in dataclasses.fields(kind)
-        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-    ]
+    required = fields[: len(fields) - len(kind.__struct_defaults__)]
     assert [name for name in fields if f"({name}" not in row[5]] == required
     number, unit = row[4].split()
     assert int(number) * UNITS[unit] == LIMITS[kind.KIND]

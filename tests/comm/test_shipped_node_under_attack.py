@@ -16,10 +16,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from msgspec import Struct
 
 from petrobot.services.comm.protocol import messages as m
 from tests.comm import foreign as f
@@ -37,8 +37,7 @@ BEAT = 0.1
 """Interval of the good caller's messages (s); after 1 s of silence it would be cut off, too."""
 
 
-@dataclass
-class Vision:
+class Vision(Struct):
     """The node process."""
 
     process: subprocess.Popen[str]

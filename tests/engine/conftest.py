@@ -4,10 +4,10 @@ out."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import (
     Begin,

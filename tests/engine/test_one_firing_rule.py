@@ -8,13 +8,13 @@ from the compiled tables that all of them read.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.net.explore import (
     ExplorationEngine as Explorer,

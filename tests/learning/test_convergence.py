@@ -7,10 +7,9 @@ lower bounds.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.batch import Response
 from petrobot.coordinator.learning.rules import NikolicFu, Rule, Tracking

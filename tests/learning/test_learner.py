@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from math import isnan
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import Engine, Override, State
 from petrobot.coordinator.engine.instructions import Corrected, RunRecorded, StartRun

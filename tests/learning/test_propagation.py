@@ -3,12 +3,12 @@ cause, and the sorting task."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import exp, hypot, isnan, sqrt
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
 from scipy.stats import t as student
 
 from petrobot.coordinator.analysis.time.completion import completion

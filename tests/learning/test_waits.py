@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from itertools import count
 from math import exp, sqrt
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.execution.chain import played as mission_figures
 from petrobot.coordinator.analysis.execution.graph import execute
@@ -139,8 +140,7 @@ back = { in = ["rest:normal"], out = ["ready"], event = "alarm" }
 """The belt moves on twice for one part, each time when the event comes."""
 
 
-@dataclass
-class Played:
+class Played(Struct):
     """What missions of the engine came to."""
 
     trials: list[Trial] = field(default_factory=list)

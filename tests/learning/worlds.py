@@ -4,16 +4,16 @@ study of docs/figures-selectors.md."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.batch import Array, Batch, Index, Response
 from petrobot.coordinator.learning.rules import Rule
 
 
-@dataclass(frozen=True)
-class BanditWorld:
+class BanditWorld(Struct, frozen=True):
     """Reliability and mean cost of each action; from trial `change` on those of `later`."""
 
     name: str
@@ -52,8 +52,7 @@ def gapped(gap: float, best: float = 0.9, n: int = 4) -> BanditWorld:
     return BanditWorld(f"gap {gap:g}", (best - gap, *([best - gap] * (n - 2)), best), (1.0,) * n)
 
 
-@dataclass
-class PlayedTrials:
+class PlayedTrials(Struct):
     """Result of a simulation: arrays over seeds (rows)."""
 
     batch: Batch

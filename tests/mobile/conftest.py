@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.mobile.detection import FloorView
@@ -15,8 +15,7 @@ Vector = NDArray[np.float64]
 TURN = {"S": 0, "L": 1, "R": -1}
 
 
-@dataclass(frozen=True)
-class DrawnPose:
+class DrawnPose(Struct, frozen=True):
     """A place on the floor (m) and a heading (rad)."""
 
     x: float

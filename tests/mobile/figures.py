@@ -13,9 +13,9 @@ import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from msgspec import Struct
 from scipy import stats
 
 from tests.mobile.measure import wilson
@@ -26,8 +26,7 @@ WIDTH, HEIGHT, LEFT, TOP = 420.0, 250.0, 50.0, 34.0
 RUN = re.compile(r"^\d+ (ok |BAD) +([\d.]+) s,.* rms ([\d.]+) max ([\d.]+) mm")
 
 
-@dataclass(frozen=True)
-class FigureRow:
+class FigureRow(Struct, frozen=True):
     """One run of a campaign: its regime, the recovery that was chosen first, and how long it took
     (s)."""
 

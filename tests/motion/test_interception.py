@@ -4,11 +4,11 @@ without jumps."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.services.motion.interception import STRATEGIES, CatchPlan, Interceptor, Prediction
 from petrobot.services.motion.kinematics import Puma, branch_of

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import Struct, field
 
 from petrobot.services.comm.location_file import ActionEntry
 from petrobot.services.comm.lockstep.party import TICK
@@ -22,8 +22,7 @@ OUTSIDE = Path(__file__).parent / "outside"
 sys.path.append(str(OUTSIDE))
 
 
-@dataclass
-class Clock:
+class Clock(Struct):
     """Simulated time, read like a clock."""
 
     now: float = 0.0
@@ -32,8 +31,7 @@ class Clock:
         return self.now
 
 
-@dataclass
-class Device:
+class Device(Struct):
     """A device under test: moves while told to, comes to rest `halting` seconds after its stop
     routine (None: never)."""
 
@@ -60,8 +58,7 @@ class Device:
         return not self.moving
 
 
-@dataclass
-class Bench:
+class Bench(Struct):
     """A runner whose actions are given as callables, driven on a clock of its own."""
 
     clock: Clock

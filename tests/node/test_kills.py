@@ -13,12 +13,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import Struct, field
 
 from petrobot.coordinator.cli import main
 from petrobot.services.node.worker_host import HUNG
@@ -58,8 +58,7 @@ def load() -> Iterator[None]:
             burner.wait()
 
 
-@dataclass
-class Tally:
+class Tally(Struct):
     """Counts of kills and calls, and their results."""
 
     kills: dict[str, int] = field(default_factory=dict)

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.services.action import CallFailed, Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.lockstep.party import TICK

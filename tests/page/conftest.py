@@ -7,7 +7,6 @@ import shutil
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -15,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 import pytest
 import pytest_asyncio
+from msgspec import Struct
 
 from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.page.server import Page, start_page
@@ -133,14 +133,16 @@ async def page(
     """Its page. With a browser it works with the background processes of the test before; one that
     is still at work when the test ends is ended."""
     async with served(stage, tasks, tmp_path / "runs", port) as made:
-        state = vars(made._page_state)
-        own = {name: state[name] for name in background if "browser" in request.fixturenames}
-        state.update((name, background[name]) for name in own)
+        state = made._page_state
+        own = {n: getattr(state, n) for n in background if "browser" in request.fixturenames}
+        for name in own:
+            setattr(state, name, background[name])
         yield made
         for process in background.values():
             if process._current is not None:
                 await process.close()
-        state.update(own)
+        for name, process in own.items():
+            setattr(state, name, process)
 
 
 def browser_missing() -> str:
@@ -249,8 +251,7 @@ async def _chromium() -> AsyncIterator[Browser]:
         await launched.close()
 
 
-@dataclass
-class KeptWindow:
+class KeptWindow(Struct):
     """A window that stays open for the next test: most of what a new one costs is its process."""
 
     tab: Tab | None = None

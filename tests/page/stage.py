@@ -6,9 +6,10 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.engine import (
     Abort,
@@ -54,8 +55,7 @@ from petrobot.services.comm.protocol.messages import Feedback
 BEAT_S = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(Struct, frozen=True):
     """Script of one run of an action."""
 
     seconds: float = 0.2
@@ -66,16 +66,14 @@ class Part:
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass
-class _Playing:
+class _Playing(Struct):
     start: StartRun
     part: Part
     done: float = 0.0
     held: bool = False
 
 
-@dataclass
-class Controls:
+class Controls(Struct):
     """Client that holds the controls, and clients that ask for them."""
 
     holder: str | None = None

@@ -10,11 +10,11 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import pytest_asyncio
+from msgspec import Struct
 
 from tests.page.conftest import abort, browser_missing, toasted
 
@@ -66,8 +66,7 @@ seconds = 0.3
 """
 
 
-@dataclass
-class Served:
+class Served(Struct):
     """A permanent coordinator, as a process."""
 
     process: asyncio.subprocess.Process

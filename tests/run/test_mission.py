@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import Corrected, Engine, Finished, Fired, Report, RunRecorded
 from petrobot.coordinator.engine.instructions import Marked, Severity

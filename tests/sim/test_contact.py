@@ -6,12 +6,12 @@ import gc
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from msgspec.structs import replace
 
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
 from petrobot.sim.catching.ball_contact import contact_at, numbers_of

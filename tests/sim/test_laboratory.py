@@ -7,12 +7,12 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from petrobot.services.comm.lockstep.channels import images_wanted
 from petrobot.services.comm.lockstep.party import TICK

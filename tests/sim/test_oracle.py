@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.sim.catching.oracle import Oracle, OracleVerdict
 from petrobot.sim.catching.site import CupMount, Site

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import fields
 
 from petrobot.sim.catching.puma_model import read_arm
 from petrobot.sim.catching.site import Site, read_site

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.ball import BallState, TableMotion, fly
@@ -39,7 +39,7 @@ class WorldByHand:
 
     def throw(self, n: int, **changes: object) -> ThrowCourse:
         thrown = draw_throw(5, n, self.site.cell, self.truth)
-        return self.world.release(self.now, replace(thrown, **changes))  # type: ignore[arg-type]
+        return self.world.release(self.now, replace(thrown, **changes))
 
     def where_it_will_be(self, throw: Throw, fall: float) -> tuple[float, BallState]:
         """Return the time after release (s) and the ball's state when it is this far (m) below the

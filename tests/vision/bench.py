@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.action import Cancelled, Result, Status, Wait
@@ -56,8 +57,7 @@ def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:
     return {**view, **changes}
 
 
-@dataclass(frozen=True)
-class RolledBall:
+class RolledBall(Struct, frozen=True):
     """A ball that slides, then rolls on a straight line; written from the mechanics, independent of
     services and sim.
 

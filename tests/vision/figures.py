@@ -11,11 +11,11 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
 import numpy as np
+from msgspec import Struct, field
 
 from petrobot.services.action import Result
 from petrobot.services.vision import actions
@@ -68,8 +68,7 @@ class TimedBench(CameraBench):
         self.own += time.process_time() - begin
 
 
-@dataclass
-class LocatorTally:
+class LocatorTally(Struct):
     """Results of many runs of one alternative."""
 
     ends: Counter[str] = field(default_factory=Counter)

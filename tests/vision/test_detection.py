@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import Struct
 
 from petrobot.services.vision.calibration import DEFAULT, parse_calibration
 from petrobot.services.vision.locating import Confirmation
@@ -37,8 +37,7 @@ def view(cell: dict[str, Any]) -> TableView:
     )
 
 
-@dataclass(frozen=True)
-class Scores:
+class Scores(Struct, frozen=True):
     """Share of balls found, their rms error (m), and false candidates per image."""
 
     found: float

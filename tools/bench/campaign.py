@@ -15,8 +15,9 @@ import statistics
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli.loading import task_path
 from petrobot.coordinator.launch import Setting, lockstep_cell

@@ -16,11 +16,11 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.rules import NikolicFu, Rule

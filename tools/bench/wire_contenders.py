@@ -11,9 +11,10 @@ import os
 import socket
 import time
 from collections.abc import Awaitable, Coroutine
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
+
+from msgspec.structs import replace
 
 from petrobot.services.comm.calls.callee import Callee, Offer
 from petrobot.services.comm.calls.caller import Caller

@@ -14,11 +14,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+from msgspec import Struct
 from tools.proof.proof import ROOT
 
 from petrobot.coordinator.studies.campaign.table import TABLE, TrialRow, read_table
@@ -35,8 +35,7 @@ time to time, so memory that native libraries never free does not add up during 
 Result = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Sizes:
+class Sizes(Struct, frozen=True):
     """Sizes of the campaigns; the full proof has share 1."""
 
     share: float

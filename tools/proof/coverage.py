@@ -15,12 +15,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 from tools.proof.proof import ROOT, FigureProof, Result, digest
 
@@ -46,8 +46,7 @@ KNOWN = 4000
 # --- worlds -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(Struct, frozen=True):
     """The k-th run in one place, over all trials. Arrays (trials,)."""
 
     place: str
@@ -64,8 +63,7 @@ class Column:
     """The transition that consumes the token unless the run ends with ERROR."""
 
 
-@dataclass
-class Drawn:
+class Drawn(Struct):
     """Trials as columns. A trial is completed unless `given_up`."""
 
     time: Values
@@ -153,8 +151,7 @@ class Drawn:
 Draw = Callable[[np.random.Generator, int], Drawn]
 
 
-@dataclass(frozen=True, eq=False)
-class World:
+class World(Struct, frozen=True, eq=False):
     """A task and the function that draws its trials. `choose`: other choices of the new trials (a
     what-if); `drawn_so`: draws trials with these choices."""
 

@@ -20,12 +20,12 @@ import json
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from tools.proof.campaigns import Result, Sizes, campaign, rows_of
 from tools.proof.proof import LOCK_STEP, ROOT, FigureProof, digest
 
@@ -65,8 +65,7 @@ SELECTOR = "nikolic_fu_fast"
 Actions = Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class Study:
+class Study(Struct, frozen=True):
     """The options of a study and what all its parts share."""
 
     sizes: Sizes

@@ -21,8 +21,9 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+
+from msgspec import Struct
 
 ROOT = Path(__file__).parents[2]
 COPIED = (
@@ -35,8 +36,7 @@ LIMIT_S = 1800.0
 about the fault: the machine was too busy."""
 
 
-@dataclass(frozen=True)
-class Mutation:
+class Mutation(Struct, frozen=True):
     """One fault: a text that occurs once in a file, what replaces it, and the tests to run."""
 
     name: str

@@ -10,10 +10,11 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct
 
 ROOT = Path(__file__).parents[2]
 KEPT = ROOT / "reports" / "proof"
@@ -33,8 +34,7 @@ SUFFIXES = (".py", ".toml", ".eds", ".js", ".css", ".html")
 Result = Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class FigureProof:
+class FigureProof(Struct, frozen=True):
     """One promised figure.
 
     `chapter` is its table in docs/figures.md. `sources` are the folders and files whose change

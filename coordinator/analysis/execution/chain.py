@@ -17,13 +17,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import inf, sqrt
 from typing import TypeVar
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.graph import ExecutionGraph
@@ -88,8 +89,7 @@ class TooLarge(ValueError):  # noqa: N818 - a limit of the analysis
     too many changes of a state."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Outcome:
+class _Outcome(Struct, frozen=True):
     """One outcome of a stimulus: the next state, the number of the edge (-1 if it has none), for
     each clock of the next state the clock of the present state that continues as it (-1: a new
     clock), the probability of this outcome, and whether a run is recorded that did not end with
@@ -102,8 +102,7 @@ class _Outcome:
     spoils: bool = False
 
 
-@dataclass(frozen=True)
-class _Plan:
+class _Plan(Struct, frozen=True):
     """What can happen in a state of the execution graph."""
 
     slots: tuple[tuple[str, str], ...]
@@ -116,8 +115,7 @@ class _Plan:
     """Outcomes that come after an exponential wait, each with its rate (1/s)."""
 
 
-@dataclass(frozen=True)
-class ExecutionChain:
+class ExecutionChain(Struct, frozen=True, dict=True):
     """The Markov chain: edges with their probabilities, and mean times (s) by state."""
 
     x: ExecutionGraph
@@ -246,8 +244,7 @@ def chain_of(
     return builder.result(stages) if stages > 1 else coarse
 
 
-@dataclass(frozen=True, slots=True)
-class MissionFigures:
+class MissionFigures(Struct, frozen=True):
     """What missions gave that were played with undivided clocks."""
 
     missions: int

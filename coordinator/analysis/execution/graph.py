@@ -13,15 +13,17 @@ the beginning, so that a dead end far away is found.
 
 from __future__ import annotations
 
+import dataclasses
 from bisect import bisect
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import cycle
 from math import exp
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.names import (
@@ -105,14 +107,14 @@ def in_words(steps: Sequence[object]) -> list[str]:
     return told
 
 
-@dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True)
 class Step:
     """An edge of a path: a stimulus in words, and the transitions that it fires. Steps with the
     same words are equal: their stimuli differ in the ids of runs alone."""
 
     text: str
     firings: tuple[str, ...]
-    stimulus: Stimulus = field(compare=False)
+    stimulus: Stimulus = dataclasses.field(compare=False)
     """The first one found."""
 
     @property
@@ -138,8 +140,7 @@ class Step:
         return f"{self.text} -> {' '.join(firings) or 'nothing'}{more}"
 
 
-@dataclass(frozen=True)
-class ExecutionGraph:
+class ExecutionGraph(Struct, frozen=True, dict=True):
     """The states found and their edges. If the search stopped early, only the states in `expanded`
     have their edges, `complete` is False and `reason` says why."""
 
@@ -166,9 +167,9 @@ class ExecutionGraph:
     """By action place with one server: a state in which it has more tokens."""
     contests: dict[tuple[str, ...], int]
     """By conflict that neither priority nor weight decides: a state in which it occurs."""
-    index: Mapping[Hashable, int] = field(repr=False)
+    index: Mapping[Hashable, int]
     """Number of each state, by the parts of it on which the future depends."""
-    shared: Shared = field(repr=False)
+    shared: Shared
     by_hand: Mask
     """Which edges are commands of the operator; only `with_operator` adds them."""
 
@@ -483,8 +484,7 @@ def spoiling(task: Task) -> tuple[int, ...]:
     return tuple(p for p, name in enumerate(net.places) if name in empty and p not in taken)
 
 
-@dataclass
-class _Search:
+class _Search(Struct):
     engine: Engine
     names: Names
     shared: Shared

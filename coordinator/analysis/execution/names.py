@@ -9,9 +9,11 @@ clocks, records, reports and arguments: no firing depends on them (docs/executio
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from itertools import permutations, product
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import (
     AddTokens,
@@ -56,8 +58,7 @@ class TooManyValues(ValueError):  # noqa: N818 - a limit of the analysis, not a 
     """A run can end with too many combinations of values to try them all."""
 
 
-@dataclass(frozen=True)
-class Cause:
+class Cause(Struct, frozen=True):
     """A stimulus that can arrive in a state, and its words in a path."""
 
     stimulus: Stimulus

@@ -19,12 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.causes import (
@@ -97,8 +98,7 @@ EXAMINED = 1_000
 """The most dead-end states that are followed to where they stop; the nearest come first."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recovery:
+class Recovery(Struct, frozen=True):
     """What happens after an error exit, judged over all states just after it."""
 
     error_exit: str
@@ -129,8 +129,7 @@ class Recovery:
         return self.possible.holds, self.almost_sure.holds, self.kappa
 
 
-@dataclass(frozen=True)
-class Odds:
+class Odds(Struct, frozen=True):
     """Probability and mean time of the return to the nominal flow, for each error exit."""
 
     by_exit: Mapping[str, tuple[float, float]]
@@ -143,8 +142,7 @@ class Odds:
     """Why there are no numbers; empty if there are."""
 
 
-@dataclass(frozen=True, slots=True)
-class Contest:
+class Contest(Struct, frozen=True):
     """A conflict that neither priority nor weight decides: first come, first served."""
 
     transitions: tuple[str, ...]
@@ -155,8 +153,7 @@ class Contest:
     """The verdicts that would not hold if another fired, with their reasons."""
 
 
-@dataclass(frozen=True)
-class DeadEnd:
+class DeadEnd(Struct, frozen=True):
     """Dead ends with the same marked places: how many, and the nearest with its cause."""
 
     count: int
@@ -170,8 +167,7 @@ class DeadEnd:
         return self.verdict.witness
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(Struct, frozen=True, dict=True):
     """The verdicts on an execution graph. If the graph is not complete, a verdict is either refuted
     by what was found or unknown."""
 

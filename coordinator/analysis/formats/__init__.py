@@ -7,10 +7,11 @@ with a net: a feature that the net has and the table does not promise for the fo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from re import Pattern
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.analysis.formats import exports, greatspn, pnml, tina
 from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
@@ -62,8 +63,7 @@ LARGEST_CHAIN = SearchLimits(states=1_000_000, memory=2 << 30)
 """Limits of the search when the chain of a net is written."""
 
 
-@dataclass(frozen=True)
-class Format:
+class Format(Struct, frozen=True):
     """What a file format can say: `says` maps a feature to KEPT or to the form it is written in."""
 
     write: Callable[[NetFile], str]

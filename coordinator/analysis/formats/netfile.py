@@ -9,11 +9,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Container, Mapping
-from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import chain, count
 from typing import Any
 from xml.etree.ElementTree import Element
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.time.gspn import Gspn
@@ -41,8 +43,7 @@ class NetFileError(InputError, ValueError):
         return f"{at}: {self.element}: {self.problem}" + (f"; {self.remedy}" if self.remedy else "")
 
 
-@dataclass(frozen=True)
-class NetFile:
+class NetFile(Struct, frozen=True):
     """A net and everything else that its file contains.
 
     Places and transitions are named by the ids in the file.
@@ -60,7 +61,7 @@ class NetFile:
     """How the net here differs from its file, without effect on the behaviour."""
     beyond: tuple[str, ...] = ()
     """What the file contains beyond the net: pages, drawings, data of other tools."""
-    document: Element | None = field(default=None, compare=False, repr=False)
+    document: Element | None = None
     """The XML tree of an ISO PNML file, so that writing PNML keeps what is in `beyond`."""
 
     def with_names(self, legal: re.Pattern[str]) -> tuple[NetFile, dict[str, str]]:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import cast
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.analysis.formats.netfile import BETWEEN, FILE, NetFileError
 from petrobot.coordinator.analysis.limits import keep_time
@@ -32,8 +33,7 @@ class LineElement(Element):
     line: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Only:
+class Only(Struct, frozen=True):
     """Accepted with one of these values (compared without spaces, in lower case), else refused."""
 
     values: tuple[str, ...]
@@ -47,8 +47,7 @@ class Only:
         return plain in self.values or bool(self.form and re.fullmatch(self.form, plain))
 
 
-@dataclass(frozen=True, slots=True)
-class Note:
+class Note(Struct, frozen=True):
     """Accepted with any value; if it is not one of `silent`, the reader adds the text as a note."""
 
     silent: tuple[str, ...]
@@ -60,8 +59,7 @@ DRAWN = "drawn"
 Known = str | Only | Note
 
 
-@dataclass(frozen=True)
-class Vocabulary:
+class Vocabulary(Struct, frozen=True):
     """What a reader knows of one element: its attributes and its children, by local name."""
 
     attributes: Mapping[str, Known] = field(default_factory=dict)

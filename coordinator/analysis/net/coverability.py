@@ -17,10 +17,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from operator import ge
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.limits import overtime
 from petrobot.coordinator.analysis.net.space import Space
@@ -38,8 +38,7 @@ COMPARISONS = 100
 """The most comparisons with ancestors, per allowed node: limits the time on long chains."""
 
 
-@dataclass(frozen=True, slots=True)
-class Coverability:
+class Coverability(Struct, frozen=True):
     """How many tokens each place can hold, as far as it is known.
 
     `bounded` is None if unknown; `reason` says why. `bounds[p]` is exact for a net without
@@ -140,8 +139,7 @@ def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[i
     )  # fmt: skip
 
 
-@dataclass(slots=True)
-class _Node:
+class _Node(Struct):
     marking: Marking
     parent: int
     fired: int

@@ -16,7 +16,8 @@ or adds tokens where the other has an inhibitor or a capacity.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.limits import OutOfTime, keep_time, overtime
 from petrobot.coordinator.task.net import Arcs, Marking, Net
@@ -25,8 +26,7 @@ SIPHON_EFFORT = 5_000
 """Branches after which the enumeration of siphons or traps gives up."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceSets:
+class PlaceSets(Struct, frozen=True):
     """Minimal sets of places, by place number; all of them if `complete`."""
 
     sets: tuple[frozenset[int], ...]
@@ -148,8 +148,7 @@ HUNT_EFFORT = 100_000
 """Markings after which the search by stubborn sets gives up."""
 
 
-@dataclass(frozen=True, slots=True)
-class Hunt:
+class Hunt(Struct, frozen=True):
     """Result of a search for a deadlock.
 
     `firings` lead to a dead marking. If they are None and `complete` is True,
@@ -161,8 +160,7 @@ class Hunt:
     complete: bool
 
 
-@dataclass(frozen=True)
-class _Relations:
+class _Relations(Struct, frozen=True):
     conflicts: tuple[tuple[int, ...], ...]
     """By transition: the transitions that it can disable or that can disable it."""
     raising: tuple[tuple[int, ...], ...]

@@ -24,13 +24,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, combinations, combinations_with_replacement, count, product
 from math import comb, prod
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.execution.names import (
@@ -74,8 +75,7 @@ class TooManyCases(ValueError):  # noqa: N818 - a limit of the analysis, not a f
     """A transition or an end of a run has more cases than N may have."""
 
 
-@dataclass(frozen=True)
-class EndsNet:
+class EndsNet(Struct, frozen=True):
     """N, and what its elements are in the task."""
 
     task: Task

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from array import array
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.pack import Layout, Rules, Test, TooManyTokens, Words
@@ -17,8 +17,7 @@ Labels = NDArray[Any]
 """Transition of each edge: int16, or int32 if the net has 32,768 transitions or more."""
 
 
-@dataclass(frozen=True)
-class Explored:
+class Explored(Struct, frozen=True):
     """State of a breadth-first search: the markings found, the first `len(row) - 1` expanded."""
 
     net: Net

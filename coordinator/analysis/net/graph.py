@@ -7,12 +7,12 @@ handled without scipy, because importing it takes longer than a quick check.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import keep_time
@@ -29,8 +29,7 @@ SWEPT = 1 << 17
 """Edges of a block of a sweep."""
 
 
-@dataclass(frozen=True)
-class Graph:
+class Graph(Struct, frozen=True, dict=True):
     """Vertices 0 to n - 1. Edge e goes from source[e] to target[e]; edges are sorted by source."""
 
     n: int

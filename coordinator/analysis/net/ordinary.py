@@ -6,11 +6,11 @@ Its ordinary net is `Task.net` (docs/semantics.md, section 8).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.space import BLOCK
@@ -24,8 +24,7 @@ from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.net import Marking
 
 
-@dataclass(frozen=True)
-class OrdinaryView:
+class OrdinaryView(Struct, frozen=True, dict=True):
     """Sets of places, transitions and markings of a task's ordinary net."""
 
     task: Task

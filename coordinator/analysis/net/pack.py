@@ -12,10 +12,10 @@ the caller widens the field and continues.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.graph import Mask
@@ -32,8 +32,7 @@ class TooManyTokens(ValueError):  # noqa: N818 - a fact about the net, named as 
     """A place holds more tokens than a machine word can count."""
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(Struct, frozen=True, dict=True):
     """Where the field of each place lies: `width` value bits from bit `shift` of word `word` on,
     the guard bit above."""
 
@@ -172,8 +171,7 @@ class Layout:
         ]
 
 
-@dataclass(frozen=True, slots=True)
-class Test:
+class Test(Struct, frozen=True):
     """One mask test of a transition: it passes in M when `(M | G) - sub & guard == want`."""
 
     __test__ = False  # not a test class for pytest
@@ -183,8 +181,7 @@ class Test:
     want: int
 
 
-@dataclass(frozen=True)
-class Rules:
+class Rules(Struct, frozen=True, dict=True):
     """The transitions of a net compiled for a layout; `able` are those that this layout's token
     counts can ever enable."""
 

@@ -9,9 +9,8 @@ the same: the transition labels an edge on a cycle.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.coverability import Coverability, coverability, find_pump
@@ -38,8 +37,7 @@ GROUPS = 100
 """The most groups of deadlocks that are reported one by one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Deadlock:
+class Deadlock(Struct, frozen=True):
     """Dead markings with the same marked places: how many, and a shortest path to the nearest."""
 
     marked: tuple[str, ...]
@@ -49,8 +47,7 @@ class Deadlock:
     """Places of the largest empty siphon: no firing can ever mark them again."""
 
 
-@dataclass(frozen=True)
-class Qualitative:
+class Qualitative(Struct, frozen=True):
     """All verdicts on one net. If the space is not complete, levels, bounds and counts are those
     of the part that was found."""
 

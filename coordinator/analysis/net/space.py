@@ -10,11 +10,11 @@ out to be large.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import OUT_OF_MEMORY, memory_limit, overtime
@@ -54,8 +54,7 @@ SHARED = "of which searches get a part"
 """Why a search ends before the whole limit is used up."""
 
 
-@dataclass(frozen=True, slots=True)
-class SearchLimits:
+class SearchLimits(Struct, frozen=True):
     """Limits of a search in markings, seconds and bytes; None means no limit.
 
     `memory` is for the search and the verdicts on what it finds, so the engine itself may hold one
@@ -78,8 +77,7 @@ class SearchLimits:
             raise ValueError("a limit in seconds needs a clock; pass clock=time.monotonic")
 
 
-@dataclass(frozen=True)
-class Space:
+class Space(Struct, frozen=True, dict=True):
     """The reachable markings found, in breadth-first order (0 is the initial one), and their edges.
 
     Edge e of marking i, with `row[i] <= e < row[i + 1]`, fires transition `label[e]` and leads to
@@ -99,7 +97,7 @@ class Space:
     complete: bool
     reason: str
     engine: str
-    _columns: dict[int, Tokens] = field(default_factory=dict, repr=False, compare=False)
+    _columns: dict[int, Tokens] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.words)

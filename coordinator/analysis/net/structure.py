@@ -10,11 +10,11 @@ sections V to VII.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from math import gcd, lcm
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import overtime
@@ -30,8 +30,7 @@ Vector = dict[int, int]
 """A sparse integer vector: its non-zero entries by index."""
 
 
-@dataclass(frozen=True, slots=True)
-class Semiflows:
+class Semiflows(Struct, frozen=True):
     """Non-negative integer solutions of minimal support; all of them if `complete`."""
 
     vectors: tuple[Vector, ...]
@@ -228,8 +227,7 @@ def implied_places(flows: Semiflows, bounds: Sequence[int | None]) -> frozenset[
     return frozenset(place for place, _ in pivots)
 
 
-@dataclass(frozen=True, slots=True)
-class Lyapunov:
+class Lyapunov(Struct, frozen=True):
     """What is known of a linear Lyapunov function y.M of a net: y > 0 and y^T C <= 0, so no firing
     increases y.M.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
+from msgspec import Struct, field
 
-@dataclass(frozen=True, slots=True)
-class Witness:
+
+class Witness(Struct, frozen=True):
     """A firing sequence from the initial marking that demonstrates a verdict.
 
     `Net.replay(firings)` repeats it. `marking` holds the marked places after `firings`. `loop`, if
@@ -28,8 +28,7 @@ class Witness:
         return out | ({"steps": list(self.steps)} if self.steps else {})
 
 
-@dataclass(frozen=True, slots=True)
-class PropertyVerdict:
+class PropertyVerdict(Struct, frozen=True):
     """Whether a property holds (True, False, or None for unknown), and the reason as a sentence.
 
     `details` explain the reason, a line each: what else is missing, and where its tokens went.

@@ -14,9 +14,8 @@ These are first-step equations of absorbing chains (J. G. Kemeny, J. L. Snell, F
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
@@ -25,17 +24,16 @@ from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import Generator, poisson_weights, visits_before
 
 
-@dataclass(frozen=True)
-class Completion:
+class Completion(Struct, frozen=True):
     """Completion from the initial marking. Times in seconds, given that the task completes."""
 
     chain: Chain
     goal: Mask
-    h: Values = field(repr=False)
+    h: Values
     """Probability of completing, from each marking."""
-    y: Values = field(repr=False)
+    y: Values
     """E[T; complete] from each marking (s)."""
-    z: Values = field(repr=False)
+    z: Values
     """E[T^2; complete] from each marking (s^2)."""
     residual: float
     """Largest error of the three equations, relative to their largest values."""
@@ -93,8 +91,7 @@ LOOK = 16
 """Jumps between two checks of how much probability is still to come."""
 
 
-@dataclass(frozen=True)
-class CompletionTime:
+class CompletionTime(Struct, frozen=True):
     """Distribution of the time to completion, by uniformisation.
 
     Jumps occur as a Poisson process of `rate` (1/s); absorbed[k] is the probability that the goal
@@ -181,8 +178,7 @@ def _open_edges(
 # Learning and Optimization, Springer 2007.
 
 
-@dataclass(frozen=True, slots=True)
-class Slope:
+class Slope(Struct, frozen=True):
     """How a number changes with one parameter.
 
     `derivative` is per unit of the parameter, `elasticity` in per cent per per cent. If the weights

@@ -14,11 +14,12 @@ elimination, and the flow through immediate transitions is known without extra w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import keep_time
@@ -35,8 +36,7 @@ class TimelessTrap(ValueError):  # noqa: N818 - names what was found in the net
     """From some marking immediate transitions fire for ever, and time never passes again."""
 
 
-@dataclass(frozen=True)
-class Gspn:
+class Gspn(Struct, frozen=True):
     """A net with a rate or a weight for each transition.
 
     `rate[t]` (1/s) is None for an immediate transition, which is chosen with a probability
@@ -147,8 +147,7 @@ class Gspn:
         return able if servers is None else np.minimum(able, servers)
 
 
-@dataclass(frozen=True)
-class Chain:
+class Chain(Struct, frozen=True, dict=True):
     """The Markov chain of a GSPN over its reachable markings, vanishing ones included.
 
     It starts in marking 0. Edges are sorted by source. `amount[e]` is a rate (1/s) if the source is

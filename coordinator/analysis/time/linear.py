@@ -14,11 +14,11 @@ ones come from Gauss-Seidel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.limits import keep_time
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, ranges, sum_by
@@ -38,8 +38,7 @@ class NotConverged(ArithmeticError):  # noqa: N818 - a fact about an iteration
     """An iteration did not reach its tolerance; the message says how far it came."""
 
 
-@dataclass(frozen=True)
-class SolveOrder:
+class SolveOrder(Struct, frozen=True):
     """The order in which the strong components of a graph are solved: successors first.
 
     Built once and used for many right-hand sides.

@@ -7,20 +7,19 @@ ending in each. The result carries the residual of its balance equations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, exp, lgamma, log, sqrt
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.net.graph import Graph, Index, sum_by
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
 from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
 
 
-@dataclass(frozen=True)
-class LongRun:
+class LongRun(Struct, frozen=True, dict=True):
     """Stationary behaviour from the initial marking.
 
     `probability[i]` is the share of time in marking i (0 if vanishing), `flow[e]` the frequency of
@@ -134,8 +133,7 @@ def visits_before(chain: Chain, transient: Any, start: Values | None = None) -> 
     return solve(SolveOrder.of(backward, transient), value, begin if start is None else start)
 
 
-@dataclass(frozen=True)
-class Generator:
+class Generator(Struct, frozen=True):
     """The chain over tangible markings only, uniformised: P = I + Q / rate, Q its generator."""
 
     tangible: Index

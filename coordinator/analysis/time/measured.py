@@ -8,10 +8,12 @@ assume the same, and say it in the same words.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import sqrt
 from typing import NamedTuple, TypeVar
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.net.structure import exclusive_places, place_semiflows
 from petrobot.coordinator.task import (
@@ -39,8 +41,7 @@ DECLARED, MEASURED = "declared in the task file", "measured"
 """Where the numbers of an action come from."""
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(Struct, frozen=True):
     """Numbers measured in runs. Missing ones are replaced by the estimates in the task file.
 
     - `runs[(place or primitive task, action)]`: share, mean (s) and cv by status.
@@ -208,8 +209,7 @@ class NoEstimate(ValueError):  # noqa: N818 - names what is missing
     """A number that the stochastic view needs was neither measured nor declared."""
 
 
-@dataclass(frozen=True)
-class Numbers:
+class Numbers(Struct, frozen=True):
     """What is measured or declared of a task, measured first."""
 
     task: Task

@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from math import isfinite
+
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.formats.netfile import NetFileError, evaluate
 from petrobot.coordinator.analysis.time.markov import LongRun
@@ -26,8 +27,7 @@ CALL = re.compile(r"([A-Za-z_]\w*)\(\s*([^()]*?)\s*\)")
 FORM = "write an expression of time(Q), late(S), rate(T), tokens(P), marked(P), mean, P_complete"
 
 
-@dataclass(frozen=True, slots=True)
-class Measure:
+class Measure(Struct, frozen=True):
     """A measure as it was written, and its name in tables."""
 
     name: str

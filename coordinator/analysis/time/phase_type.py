@@ -14,15 +14,15 @@ of the 90 % quantile says by how much.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import ceil, exp, sqrt
+
+from msgspec import Struct
 
 STAGES = 64
 """Default limit of the stages of one duration."""
 
 
-@dataclass(frozen=True, slots=True)
-class ErlangBranch:
+class ErlangBranch(Struct, frozen=True):
     """Taken with `probability`: `stages` exponential phases of `rate` (1/s) in a row."""
 
     probability: float
@@ -30,8 +30,7 @@ class ErlangBranch:
     rate: float
 
 
-@dataclass(frozen=True, slots=True)
-class PhaseType:
+class PhaseType(Struct, frozen=True):
     """A duration distribution: `shift` (s), then one of the branches.
 
     A Markov chain can represent it only if the shift is 0.

@@ -9,11 +9,11 @@ result.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import sqrt
 from statistics import NormalDist
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.limits import overtime
@@ -31,8 +31,7 @@ REMEMBERED = 1 << 22
 """The most tokens in the markings that a goal remembers: a large net seldom visits one twice."""
 
 
-@dataclass(frozen=True, slots=True)
-class IntervalEstimate:
+class IntervalEstimate(Struct, frozen=True):
     """A simulated number with its confidence interval."""
 
     mean: float
@@ -72,8 +71,7 @@ def _z(confidence: float) -> float:
     return NormalDist().inv_cdf(0.5 + confidence / 2)
 
 
-@dataclass(frozen=True)
-class Simulation:
+class Simulation(Struct, frozen=True):
     """The result of a simulation.
 
     Throughput (1/s) and mean tokens are per replica, over its observed time. `completed` is None

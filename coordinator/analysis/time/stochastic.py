@@ -21,10 +21,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, permutations, product
 from typing import NamedTuple
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView, contended
 from petrobot.coordinator.analysis.net.structure import (
@@ -188,8 +189,7 @@ def _some_enabled(waiting: Sequence[CompiledTransition]) -> Iterator[tuple[Needs
                 yield found, x.name
 
 
-@dataclass(frozen=True)
-class StochasticView:
+class StochasticView(Struct, frozen=True, dict=True):
     """A task as a GSPN. The first places are those of the ordinary net, in its order."""
 
     task: Task
@@ -278,8 +278,7 @@ def stochastic_view(
     return _Derivation(task.flat, known, stages, timer_stages, devices or {}).derive()
 
 
-@dataclass
-class _Parts:
+class _Parts(Struct):
     """The GSPN as it grows."""
 
     places: Weights

@@ -16,11 +16,12 @@ length.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.limits import OutOfTime
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
@@ -81,8 +82,7 @@ def _unrounded(derivative: float, figure: float) -> float:
     return derivative if abs(derivative) > ROUNDING * figure else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Worth:
+class Worth(Struct, frozen=True):
     """What an improvement of one action of a place would bring (exact derivatives).
 
     `time_share`: per cent of the mean mission time saved per per cent of its durations; the
@@ -99,8 +99,7 @@ class Worth:
     goal_gain: float
 
 
-@dataclass(frozen=True)
-class Forecast:
+class Forecast(Struct, frozen=True, dict=True):
     """All numbers of one stochastic view. Times in seconds, given that the task completes."""
 
     view: StochasticView

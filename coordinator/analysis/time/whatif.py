@@ -16,7 +16,9 @@ that of the errors which the action reports: runs that were ended at their deadl
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.time.gspn import Gspn
@@ -36,8 +38,7 @@ ROUNDING = 1e-9
 Runs = dict[tuple[str, str], Mapping[Status, Estimate]]
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(Struct, frozen=True):
     """One change: the name of a number, and its new value, or what multiplies it."""
 
     subject: tuple[str, ...]

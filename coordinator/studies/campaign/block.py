@@ -6,11 +6,11 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.engine.instructions import RunRecorded
 from petrobot.coordinator.launch import (
@@ -47,8 +47,7 @@ PLOTS = "plots"
 """Key of a score under which a task declares pictures of its own (docs/campaigns.md)."""
 
 
-@dataclass(frozen=True)
-class LoadedPlan:
+class LoadedPlan(Struct, frozen=True):
     """A plan with its files loaded. All blocks share it; each process loads it once."""
 
     plan: CampaignPlan

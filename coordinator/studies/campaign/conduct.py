@@ -7,11 +7,13 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, TextIO
+
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from petrobot.coordinator.studies.campaign.block import PLOTS, LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import write_estimates
@@ -54,8 +56,7 @@ class BlockPool(Protocol):
         """Run a block and return the result of `run_block`. Raises CampaignError."""
 
 
-@dataclass(frozen=True, slots=True)
-class CampaignProgress:
+class CampaignProgress(Struct, frozen=True):
     """Progress of a campaign."""
 
     done: int

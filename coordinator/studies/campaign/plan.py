@@ -11,9 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import asdict
 
 from petrobot.services.comm.location_file import MOCK, SIMULATED, same_physics
 from petrobot.services.host.json_text import json_text
@@ -32,8 +34,7 @@ class CampaignError(InputError):
     """A campaign cannot begin or continue; the text names file, key and remedy."""
 
 
-@dataclass(frozen=True)
-class CampaignPlan:
+class CampaignPlan(Struct, frozen=True):
     """A campaign. Paths are kept as given; digests tell whether the files have changed since it
     began."""
 
@@ -125,8 +126,7 @@ class CampaignPlan:
             yield batch
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
+class Block(Struct, frozen=True):
     """One mission run of a campaign."""
 
     index: int

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
@@ -21,8 +21,7 @@ from petrobot.coordinator.studies.campaign.table import TrialRow, sessions, time
 from petrobot.coordinator.task import PrimitiveTask, Task
 
 
-@dataclass
-class TrialCounts:
+class TrialCounts(Struct):
     """Counts of trials, of one regime or of all."""
 
     runs: int = 0
@@ -122,8 +121,7 @@ def comparisons(
     return out
 
 
-@dataclass
-class Summary:
+class Summary(Struct):
     """Everything that is counted in one pass over the rows."""
 
     task: Task

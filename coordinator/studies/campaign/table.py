@@ -11,9 +11,10 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.studies.campaign.plan import TABLE as TABLE, Block, CampaignError
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, waits_of
@@ -48,8 +49,7 @@ LAST = ("more", "runs", "waits", "fired")
 each run; Trial.waits; Trial.fired."""
 
 
-@dataclass
-class TrialRow:
+class TrialRow(Struct):
     """A trial of a campaign. `trial` is None if the mission run was given up before the trial
     began."""
 

@@ -8,8 +8,10 @@ contain several trials. A task without a runs place has one trial per mission ru
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from petrobot.coordinator.engine import State
 from petrobot.coordinator.engine.instructions import (
@@ -38,8 +40,7 @@ CostOf = Callable[[RunRecorded, Mapping[str, Any]], float | None]
 """Returns the cost of a recorded run, from its record and the values of its result."""
 
 
-@dataclass(slots=True)
-class RunEntry:
+class RunEntry(Struct):
     """One run of an action within a trial. Times in s."""
 
     place: str
@@ -71,7 +72,7 @@ class RunEntry:
 
     def to_plain(self) -> list[Any]:
         """Return a list in the order of the fields."""
-        return [getattr(self, name) for name in self.__slots__]
+        return [getattr(self, name) for name in self.__struct_fields__]
 
     @classmethod
     def from_plain(cls, data: Sequence[Any]) -> RunEntry:
@@ -79,8 +80,7 @@ class RunEntry:
         return cls(*data)
 
 
-@dataclass(slots=True)
-class Trial:
+class Trial(Struct):
     """One trial. Times in s."""
 
     k: int
@@ -114,7 +114,9 @@ class Trial:
     def to_plain(self) -> dict[str, Any]:
         """Return plain data, which a worker sends to the campaign."""
         plain = {
-            name: getattr(self, name) for name in self.__slots__ if name not in ("runs", "waits")
+            name: getattr(self, name)
+            for name in self.__struct_fields__
+            if name not in ("runs", "waits")
         }
         return plain | {
             "runs": [run.to_plain() for run in self.runs],

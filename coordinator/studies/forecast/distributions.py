@@ -19,10 +19,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import chi2, chi2_contingency
 
@@ -60,8 +61,7 @@ GROUPS = 6
 outcomes."""
 
 
-@dataclass(frozen=True)
-class EndDistribution:
+class EndDistribution(Struct, frozen=True):
     """The ends that were observed in one context. Arrays over its members."""
 
     outcome: Codes
@@ -86,8 +86,7 @@ class EndDistribution:
         return -math.log(left) / longest if 0.0 < left < 1.0 and longest > 0.0 else 0.0
 
 
-@dataclass(frozen=True)
-class Trend:
+class Trend(Struct, frozen=True):
     """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier`: that
     earlier duration for each member (s)."""
 
@@ -96,8 +95,7 @@ class Trend:
     earlier: Values
 
 
-@dataclass(frozen=True)
-class Split:
+class Split(Struct, frozen=True):
     """The factor that separates the contexts below a node."""
 
     kind: str
@@ -130,8 +128,7 @@ def codes_of(seen: Seen, kind: str) -> Codes:
     return {"outcome": seen.outcome, "action": seen.action, "visits": seen.visits}[kind]
 
 
-@dataclass
-class ContextNode:
+class ContextNode(Struct):
     """A node of the tree: a distribution, and a split with children unless it is a leaf."""
 
     ends: EndDistribution
@@ -434,8 +431,7 @@ Ratios = Mapping[tuple[int, int, int, int], Mapping[int, Values]]
 each replicate."""
 
 
-@dataclass(frozen=True)
-class Ends:
+class Ends(Struct, frozen=True):
     """Drawn ends of runs. Arrays (columns,)."""
 
     outcome: Codes

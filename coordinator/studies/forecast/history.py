@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import asdict, replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.may_run import Cell, devices_of
@@ -51,8 +52,7 @@ class ForecastError(InputError):
     """A forecast file cannot be made or used; the text says why."""
 
 
-@dataclass(frozen=True)
-class RunVocabulary:
+class RunVocabulary(Struct, frozen=True):
     """Numeric codes of the action places, transitions and actions of a flat task."""
 
     places: tuple[str, ...]
@@ -98,8 +98,7 @@ class RunVocabulary:
         return status - 1, taken - 1
 
 
-@dataclass(frozen=True)
-class Seen:
+class Seen(Struct, frozen=True):
     """What ended before in the same trial. Arrays (q places, n columns)."""
 
     outcome: Codes
@@ -143,8 +142,7 @@ class Seen:
         self.visits[q, columns] += 1
 
 
-@dataclass(frozen=True)
-class Runs:
+class Runs(Struct, frozen=True):
     """All runs of some trials: `n` runs, `q` action places."""
 
     place: Codes
@@ -166,7 +164,7 @@ class Runs:
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Runs:
         """Select runs."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        columns = asdict(self)
         seen: Seen = columns.pop("seen")
         return Runs(**{name: own[which] for name, own in columns.items()}, seen=seen.of(which))
 
@@ -185,8 +183,7 @@ class Waits(NamedTuple):
     rate that follows. None: all ended with a firing, and are drawn as they were measured."""
 
 
-@dataclass(frozen=True)
-class Training:
+class Training(Struct, frozen=True):
     """The measured trials of a regime."""
 
     task: Task
@@ -323,6 +320,7 @@ _WORDS = frozenset({
     "label", "x", "y", "macro", "expanded_from", "error_branch",  # for drawings
     "estimates", "mean_wait", "cost", "costs", "target_reliability",  # no run depends on them
     "holds", "subnets", "errors_to",  # arcs of the flat task say the same
+    "held", "expansion", "is_flat",  # how the task was written
 })  # fmt: skip
 """Fields of a task's elements that no trial depends on."""
 _IN_ANY_ORDER = frozenset({"inputs", "outputs", "inhibitors", "goal_transitions", "sets"})
@@ -350,12 +348,12 @@ def _alike(one: Any, other: Any, domains: Mapping[str, Domain]) -> bool:
         return equivalent(one, other, domains)
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         return one.keys() == other.keys() and all(_alike(one[k], other[k], domains) for k in one)
-    if not is_dataclass(one) or type(one) is not type(other):
+    if not isinstance(one, Struct) or type(one) is not type(other):
         return bool(one == other)
     pairs = {
-        f.name: (getattr(one, f.name), getattr(other, f.name))
-        for f in fields(one)
-        if f.compare and f.name not in _WORDS
+        name: (getattr(one, name), getattr(other, name))
+        for name in one.__struct_fields__
+        if name not in _WORDS
     }
     return all(
         Counter(a) == Counter(b) if name in _IN_ANY_ORDER else _alike(a, b, domains)

@@ -4,10 +4,10 @@ transition takes its condition admits."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.analysis.time.measured import EMERGENCY, FIELDS, is_cause
 from petrobot.coordinator.learning.waits import memory_of
@@ -36,8 +36,7 @@ from petrobot.coordinator.task.conditions.language import Scalar
 from petrobot.coordinator.task.net import CompiledNet
 
 
-@dataclass(frozen=True)
-class Move:
+class Move(Struct, frozen=True):
     """A compiled transition with what playing it needs."""
 
     transition: CompiledTransition
@@ -83,8 +82,7 @@ class Move:
         return -2 * before - yields
 
 
-@dataclass(frozen=True)
-class Structure:
+class Structure(Struct, frozen=True):
     """A flat task."""
 
     task: Task

@@ -16,11 +16,12 @@ come, first served.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from typing import Any, TypeAlias
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.pack import concession
@@ -48,8 +49,7 @@ Choices = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
 
 
-@dataclass(frozen=True)
-class Played:
+class Played(Struct, frozen=True):
     """What trials came to. Arrays (columns,); a trial that never ended has not completed."""
 
     goals: Codes
@@ -74,8 +74,7 @@ class Played:
     """By action place: how often each transition took a token out of it."""
 
 
-@dataclass
-class _Runs:
+class _Runs(Struct):
     """The runs of all columns. Arrays (rows, columns)."""
 
     phase: NDArray[np.int8]
@@ -106,18 +105,18 @@ class _Runs:
         """Return rows without runs."""
         blank: dict[str, Any] = {"phase": np.int8(IDLE), "want": -1, "device": -1, "end": np.inf}
         blank |= {"took": 0.0, "came": 0.0, "preempted": False, "beyond": False}
-        return cls(**{f.name: np.full((rows, n), blank.get(f.name, 0)) for f in fields(cls)})
+        return cls(*(np.full((rows, n), blank.get(name, 0)) for name in cls.__struct_fields__))
 
     def keep(self, kept: Mask) -> None:
         """Continue with some columns."""
-        for f in fields(self):
-            setattr(self, f.name, getattr(self, f.name)[:, kept])
+        for name in self.__struct_fields__:
+            setattr(self, name, getattr(self, name)[:, kept])
 
     def add_row(self) -> None:
         """Make room for one more run."""
         more = self.idle(1, self.phase.shape[1])
-        for f in fields(self):
-            setattr(self, f.name, np.concatenate([getattr(self, f.name), getattr(more, f.name)]))
+        for name in self.__struct_fields__:
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
 
 
 class _Variables:

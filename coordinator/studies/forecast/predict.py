@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.time.whatif import Change, statuses_of
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
@@ -80,8 +81,7 @@ OTHER_FORM = (
 NO_FIGURE: dict[str, Any] = {"value": None, "interval": None, "confidence": None}
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(Struct, frozen=True):
     """What a forecast is asked for."""
 
     runs: int

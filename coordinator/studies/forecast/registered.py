@@ -7,10 +7,11 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.may_run import Cell, assumed, devices_of
 from petrobot.coordinator.analysis.net.space import SearchLimits

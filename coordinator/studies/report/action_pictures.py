@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
@@ -32,8 +33,7 @@ WINDOW = 50
 """Runs over which shares of choices are averaged."""
 
 
-@dataclass
-class LearningCurves:
+class LearningCurves(Struct):
     """Curves of one primitive task in one regime, by action; x is the number of the trial in that
     regime, in a single run that of the run of the primitive task."""
 

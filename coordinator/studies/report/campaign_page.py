@@ -4,12 +4,12 @@ task's own pictures, faults."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from math import isfinite, nan
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from petrobot.coordinator.learning.objective import Figures, break_even, pareto
 from petrobot.coordinator.learning.statistics import wilson
@@ -44,8 +44,7 @@ Combination = tuple[tuple[str, str], ...]
 file."""
 
 
-@dataclass(frozen=True)
-class CombinationFigures:
+class CombinationFigures(Struct, frozen=True):
     """Figures of one combination of actions. `objective` is the mean J over the primitive tasks
     with alternatives, `task_objective` is J of the whole task."""
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from html import escape
 from itertools import pairwise
+
+from msgspec import Struct, field
 
 from petrobot.coordinator.studies.report.page import SERIES
 
@@ -24,8 +25,7 @@ LETTER = 6.6
 """Average width of a letter (px), for margins and legends."""
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(Struct, frozen=True):
     """A linear axis: maps values `low` to `high` to pixels `begin` to `end`."""
 
     low: float
@@ -65,8 +65,7 @@ def limits(
     return (low if zero and low == 0.0 else low - room * span), high + room * span
 
 
-@dataclass
-class Chart:
+class Chart(Struct):
     """A chart under construction: axes first, then marks."""
 
     title: str

@@ -10,11 +10,11 @@ bootstrap over pairs, all J from sums with one rho.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from math import nan
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.coordinator.studies.campaign.table import TrialRow
@@ -25,8 +25,7 @@ Z = 1.959963984540054
 Values = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class PairedTrials:
+class PairedTrials(Struct, frozen=True):
     """Trials of two campaigns with equal regime, seed and number that began in both."""
 
     one: tuple[TrialRow, ...]
@@ -148,8 +147,7 @@ def _time(pairs: PairedTrials) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class Weighting:
+class Weighting(Struct, frozen=True):
     """rho of each primitive task with alternatives, and of the task (whose cost is the duration of
     a trial)."""
 

@@ -4,8 +4,9 @@ conditions cover all cases."""
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from math import inf
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.task import (
     EarlyEvent,

@@ -6,8 +6,10 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.coordinator.task import Kind, Place, Subnet, Task
 from petrobot.coordinator.task.conditions.language import as_literal
@@ -17,8 +19,7 @@ NEVER_MARKED = "never-marked"
 """Code of the findings about places that never hold a token."""
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Struct, frozen=True):
     """One thing that is wrong or worth knowing. `code` is a fixed word for programs; `key` is the
     key in the task file."""
 
@@ -38,8 +39,7 @@ class Finding:
         return f"{self.severity}: {self.key}: {self.text}{seen}{remedy} [{self.code}]"
 
 
-@dataclass(frozen=True, slots=True)
-class CheckReport:
+class CheckReport(Struct, frozen=True):
     """All findings, errors first."""
 
     findings: tuple[Finding, ...]

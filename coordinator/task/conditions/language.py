@@ -21,6 +21,8 @@ from functools import cached_property
 from math import isfinite
 from typing import Any
 
+from msgspec import Struct
+
 Scalar = None | bool | int | float | str
 COMPARISONS = ("==", "!=", "<=", ">=", "<", ">")
 _WORDS: Mapping[str, Scalar] = {"true": True, "false": False, "none": None}
@@ -108,8 +110,7 @@ class Or:
 Node = Literal | Name | Compare | Not | And | Or
 
 
-@dataclass(frozen=True)
-class Expression:
+class Expression(Struct, frozen=True, dict=True):
     """A parsed condition; two are equal when their texts are."""
 
     text: str

@@ -11,11 +11,12 @@ gap as there are such names.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise, product
 from math import ceil, floor, prod
 from typing import Any
+
+from msgspec import Struct
 
 from petrobot.coordinator.task.conditions.language import (
     Compare,
@@ -36,8 +37,7 @@ LIMIT = 50_000
 """Assignments that are tried before the answer is `UNKNOWN`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Domain:
+class Domain(Struct, frozen=True):
     """What a name can be: kind `bool`, `int`, `float`, `str` or `any`, and the possible values of a
     `str` if they are few."""
 
@@ -55,8 +55,7 @@ class Certainty(StrEnum):
     UNKNOWN = "unknown"
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(Struct, frozen=True):
     """An answer; when refuted, `witness` are values that show it."""
 
     answer: Certainty

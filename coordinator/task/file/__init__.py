@@ -4,9 +4,10 @@ docs/task-file.md."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from enum import StrEnum
 from typing import Any
+
+from msgspec.structs import fields
 
 from petrobot.coordinator.task import Kind, Place, Reference, Subnet, Task, Transition
 from petrobot.coordinator.task.conditions import Expression

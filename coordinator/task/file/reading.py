@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from enum import StrEnum
 from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
+
+from msgspec.structs import replace
 
 from petrobot.coordinator.task import (
     Counts,

@@ -8,12 +8,12 @@ import json
 import math
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from typing import Any
 
 import aiohttp
+from msgspec import Struct, field
 
 from petrobot import Ports, SessionThread, SimulatedSession, key
 from petrobot.services.adapters.ros2.messages import LARGEST_VALUE, Message, unfit, words
@@ -151,8 +151,7 @@ _STATUS: Mapping[Any, ExchangePhase] = {
 """action_msgs/msg/GoalStatus; None: the server gives none."""
 
 
-@dataclass
-class Exchange:
+class Exchange(Struct):
     """A goal or a service call: the request, and the answers so far."""
 
     request: Message

@@ -7,9 +7,10 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
+
+from msgspec import Struct
 
 Message = dict[str, Any]
 DEPTH, ITEMS, TABLES = 16, 20_000, 1_000
@@ -133,8 +134,7 @@ BASIC: Mapping[str, tuple[type, ...]] = {
 """By basic type: the types of its values; the last one has the type's zero."""
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(Struct, frozen=True):
     """One field of a message."""
 
     type: str

@@ -17,9 +17,10 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
+
+from msgspec import Struct
 
 from petrobot import Driver, JointChain, JointMotion, Link, Ports, key, numbers
 from petrobot.services.adapters.so101 import bus
@@ -103,8 +104,7 @@ COMMANDS: Final = ("move", "open", "close", "free", "calibrate", "enable", "rest
 UNREAD: Final = bus.Reading(0, False, 2048, 2048, 0, 0.0, 0.0, 0)
 
 
-@dataclass
-class Joint:
+class Joint(Struct):
     """One joint: the last report of its servo, and its set point (rad)."""
 
     name: str

@@ -28,10 +28,11 @@ import heapq
 import math
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import msgpack
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.services.comm.calls.events import KEPT, EventBoard
 from petrobot.services.comm.calls.peers import Inline as Inline, Offer as Offer, Peers
@@ -69,8 +70,7 @@ TOO_MANY_TEXT: Final = f"raised events faster than they are stored: {KEPT:,} of 
 ORPHAN: Final = "orphan"
 
 
-@dataclass(slots=True)
-class ActiveRun:
+class ActiveRun(Struct):
     """An active run; times in seconds on the node's clock.
 
     `stopping` is set when it was ordered to stop; `reason` says why.
@@ -151,8 +151,7 @@ class ActiveRuns(dict[str, ActiveRun]):
 # What a node remembers of finished calls: results until they are acknowledged, ids for longer.
 
 
-@dataclass(frozen=True, slots=True)
-class Retention:
+class Retention(Struct, frozen=True):
     """How long the node remembers finished calls."""
 
     results: float = 600.0

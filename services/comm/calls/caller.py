@@ -18,8 +18,10 @@ from __future__ import annotations
 import heapq
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, Protocol
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from petrobot.services.comm.calls.events import EventIntake
 from petrobot.services.comm.protocol import messages as m
@@ -37,8 +39,7 @@ NEVER: Final = float("inf")
 _SPARE: Final = 256
 
 
-@dataclass(frozen=True, slots=True)
-class Patience:
+class Patience(Struct, frozen=True):
     """How long the caller waits (s)."""
 
     reconnect: float = 2.0
@@ -67,8 +68,7 @@ class Waiter(Protocol):
         """Receive the result."""
 
 
-@dataclass(slots=True)
-class PendingCall:
+class PendingCall(Struct):
     """A call without a result. `made` and the due times are on the caller's clock (s)."""
 
     call: Call
@@ -355,16 +355,14 @@ class FinishedCalls:
         self._given_up.clear()
 
 
-@dataclass(frozen=True, slots=True)
-class LateResult:
+class LateResult(Struct, frozen=True):
     """The peer's own result of a call that had already ended here (lost, given up). It is to be
     recorded and changes nothing."""
 
     outcome: Outcome
 
 
-@dataclass(frozen=True, slots=True)
-class PeerLost:
+class PeerLost(Struct, frozen=True):
     """The connection is closed."""
 
     reason: str

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from petrobot.services.comm.protocol.codec import NAME_LENGTH
 from petrobot.services.comm.protocol.messages import Event, EventAck
@@ -19,8 +20,7 @@ KEPT = 1_000
 stopped; of the outside world, the oldest is dropped."""
 
 
-@dataclass(slots=True)
-class _Kept:
+class _Kept(Struct):
     event: Event
     owner: str
     """Caller whose run raised it; empty for an event of the outside world, which goes to its
@@ -29,8 +29,7 @@ class _Kept:
     """Callers that have acknowledged it."""
 
 
-@dataclass(slots=True)
-class _Listener:
+class _Listener(Struct):
     names: frozenset[str]
     durable: bool
     """The caller (a coordinator) keeps its subscription while its connection is lost, and receives
@@ -206,8 +205,7 @@ VERDICT_EVENTS: Final = "verdict:"
 STATUSES: Final = ("success", "failure", "error")
 
 
-@dataclass(frozen=True, slots=True)
-class RunVerdict:
+class RunVerdict(Struct, frozen=True):
     """A later verdict on the outcome of a run."""
 
     run: str

@@ -16,9 +16,10 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Any, TypeVar
+
+from msgspec import Struct, field
 
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -49,8 +50,7 @@ _OWN = frozenset((Ping, Pong, Bye, Refuse))
 """Kinds that the connection handles itself."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinkTiming:
+class LinkTiming(Struct, frozen=True):
     """Times of a connection (s)."""
 
     heartbeat: float = 0.25
@@ -85,8 +85,7 @@ async def stop_accepting(server: asyncio.Server) -> None:
     server.close()
 
 
-@dataclass(frozen=True)
-class LinkLimits:
+class LinkLimits(Struct, frozen=True):
     """Limits of a server and its connections."""
 
     connections: int = field(default_factory=lambda: allowed(256, 4))

@@ -4,8 +4,9 @@ each device."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from petrobot.services.comm.protocol.messages import COORDINATOR, Call, Hello, Outcome, Refuse
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
@@ -15,8 +16,7 @@ Inline = Callable[[float, Call], Outcome]
 wait nor compute for long."""
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
+class Offer(Struct, frozen=True):
     """An action or service that this node offers."""
 
     scope: str = "network"
@@ -41,8 +41,7 @@ KNOWN: Final = 256
 """How many callers are remembered after their connection closed, and how many lost leases."""
 
 
-@dataclass(slots=True)
-class Peer:
+class Peer(Struct):
     """What is known about one caller."""
 
     role: str

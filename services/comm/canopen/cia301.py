@@ -11,9 +11,10 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
+
+from msgspec import Struct
 
 from petrobot.services.comm.canopen.bus import Frame
 
@@ -208,8 +209,7 @@ def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:
     return Frame(cob_id, struct.pack("<BHBI", 0x80, index, sub, code))
 
 
-@dataclass(frozen=True, slots=True)
-class SdoMessage:
+class SdoMessage(Struct, frozen=True):
     """A decoded SDO frame; `data` holds the bytes of an expedited transfer, or the abort code."""
 
     command: int
@@ -236,8 +236,7 @@ def parse_sdo(frame: Frame) -> SdoMessage:
     raise SdoAbortError(AbortCode.COMMAND, index, sub)
 
 
-@dataclass(frozen=True, slots=True)
-class Mapped:
+class Mapped(Struct, frozen=True):
     """One object in a PDO."""
 
     index: int
@@ -258,8 +257,7 @@ def pdo_struct(mapping: Iterable[Mapped]) -> struct.Struct:
     return layout
 
 
-@dataclass(frozen=True, slots=True)
-class Transfer:
+class Transfer(Struct, frozen=True):
     """One SDO transfer: a write of `value`, or a read if it is None."""
 
     index: int

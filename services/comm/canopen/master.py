@@ -9,9 +9,10 @@ in a cycle is defined by its `DriveInterface`. Nodes that are not drives (inputs
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Generic, Protocol, TypeVar
+
+from msgspec import Struct
 
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
@@ -67,8 +68,7 @@ class MasterPhase(Enum):
     """All drives answer each SYNC."""
 
 
-@dataclass(frozen=True, slots=True)
-class Trouble:
+class Trouble(Struct, frozen=True):
     """A fault that needs a reset.
 
     `cause` is a short code (`drive_fault`, `power`, `bus`), `axis` the drive's number from 0 or
@@ -81,8 +81,7 @@ class Trouble:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Supervision:
+class Supervision(Struct, frozen=True):
     """How strict a master is; depends on its cycle and on what a drive may do on its own
     meanwhile."""
 
@@ -128,8 +127,7 @@ class DriveInterface(Protocol):
 Link = TypeVar("Link", bound=DriveInterface)
 
 
-@dataclass(frozen=True)
-class Companion:
+class Companion(Struct, frozen=True):
     """A node on the bus that is not a drive: id, configuration, and a function for the data of its
     TPDO."""
 

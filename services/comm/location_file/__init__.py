@@ -12,10 +12,11 @@ import math
 import sys
 import traceback
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from petrobot.services.comm.location_file import reading as directory_file
 from petrobot.services.comm.lockstep.party import TICK
@@ -45,8 +46,7 @@ class DirectoryError(InputError):
         return "\n".join(self.faults)
 
 
-@dataclass(frozen=True, slots=True)
-class NodeEntry:
+class NodeEntry(Struct, frozen=True):
     """A node: one process, with its workers, at one address."""
 
     name: str
@@ -69,8 +69,7 @@ class NodeEntry:
     time."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceEntry:
+class DeviceEntry(Struct, frozen=True):
     """A device: its node, its driver ("module:Class"; empty on a simulated node) and the driver's
     own keys."""
 
@@ -80,8 +79,7 @@ class DeviceEntry:
     config: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class ActionEntry:
+class ActionEntry(Struct, frozen=True):
     """A primitive action: the primitive task that it implements, its node or device, and its limits
     (s)."""
 
@@ -105,8 +103,7 @@ class ActionEntry:
     """Start even while an earlier run of its device is still stopping (for example hold)."""
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceEntry:
+class ServiceEntry(Struct, frozen=True):
     """A general-purpose service. `run` is empty for the global memory and for services that a
     simulated node answers itself."""
 
@@ -117,8 +114,7 @@ class ServiceEntry:
     """Only callers on the node's own host may call it."""
 
 
-@dataclass(frozen=True, slots=True)
-class StreamEntry:
+class StreamEntry(Struct, frozen=True):
     """A set-point stream: the device that receives it, and the period at which it is sent (s)."""
 
     name: str
@@ -126,8 +122,7 @@ class StreamEntry:
     period: float
 
 
-@dataclass(frozen=True, slots=True)
-class TimerEntry:
+class TimerEntry(Struct, frozen=True):
     """A timer that raises the external pulse event of its name with this period (s)."""
 
     name: str
@@ -135,8 +130,7 @@ class TimerEntry:
     period: float
 
 
-@dataclass(frozen=True, slots=True)
-class Directory:
+class Directory(Struct, frozen=True):
     """The content of services.toml. The mappings keep the order of the file."""
 
     source: Path

@@ -13,7 +13,6 @@ the two paths.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -426,14 +425,10 @@ class _Spec:
     )
 
     def __init__(self, cls: type[Message]) -> None:
-        described = dataclasses.fields(cls)
         self.cls: Callable[..., Message] = cls
-        self.names = [field.name for field in described]
-        self.fields = [_FIELDS[str(field.type)] for field in described]
-        self.required = sum(
-            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-            for field in described
-        )
+        self.names = list(cls.__struct_fields__)
+        self.fields = [_FIELDS[cls.__annotations__[name]] for name in self.names]
+        self.required = len(self.names) - len(cls.__struct_defaults__)
         self.types = tuple(field.types[0] for field in self.fields)
         self.checks = self._checks(short=True)
         self.long_checks = self._checks(short=False)

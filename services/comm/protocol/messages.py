@@ -13,9 +13,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, Final
+
+from msgspec import Struct, field
 
 COORDINATOR: Final = "coordinator"
 """Name of the coordinator: its role in HELLO, its table in services.toml, its certificate."""
@@ -56,8 +57,7 @@ class Executed(StrEnum):
     UNKNOWN = "unknown"
 
 
-@dataclass(frozen=True, slots=True)
-class Hello:
+class Hello(Struct, frozen=True):
     """First message of the connecting side: who it is and which versions it speaks."""
 
     KIND: ClassVar[int] = 1
@@ -78,8 +78,7 @@ class Hello:
     docs/protocol.md."""
 
 
-@dataclass(frozen=True, slots=True)
-class Welcome:
+class Welcome(Struct, frozen=True):
     """Positive answer to Hello."""
 
     KIND: ClassVar[int] = 2
@@ -95,8 +94,7 @@ class Welcome:
     """Proof that the server knows the key; without a key a checksum of the opening."""
 
 
-@dataclass(frozen=True, slots=True)
-class Refuse:
+class Refuse(Struct, frozen=True):
     """The connection is refused, or ended because the other side broke the protocol. Nothing
     follows it."""
 
@@ -105,8 +103,7 @@ class Refuse:
     text: str
 
 
-@dataclass(slots=True)
-class Call:
+class Call(Struct):
     """Run an action or call a service.
 
     `id` is unique for ever. A node never runs the same id twice: it answers a known id with what it
@@ -134,16 +131,14 @@ class Call:
     """
 
 
-@dataclass(frozen=True, slots=True)
-class Accept:
+class Accept(Struct, frozen=True):
     """The call was accepted and its run begins."""
 
     KIND: ClassVar[int] = 5
     id: str
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
+class Feedback(Struct, frozen=True):
     """Progress of a run (fraction from 0 to 1), for people."""
 
     KIND: ClassVar[int] = 6
@@ -152,8 +147,7 @@ class Feedback:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
-class Outcome:
+class Outcome(Struct):
     """RESULT: the outcome of a call. The node keeps it until it is acknowledged."""
 
     KIND: ClassVar[int] = 7
@@ -173,8 +167,7 @@ class Outcome:
     """
 
 
-@dataclass(frozen=True, slots=True)
-class ResultAck:
+class ResultAck(Struct, frozen=True):
     """The caller has stored the result; the node may forget it."""
 
     KIND: ClassVar[int] = 8
@@ -183,8 +176,7 @@ class ResultAck:
     """Ids of further results that are acknowledged with it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cancel:
+class Cancel(Struct, frozen=True):
     """Stop a run. It still finishes with an Outcome (cause `cancelled`, unless it finished
     before)."""
 
@@ -193,8 +185,7 @@ class Cancel:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(Struct, frozen=True):
     """An event of the outside world or of an active run (`run` is its call id), or a changed
     variable."""
 
@@ -207,8 +198,7 @@ class Event:
     run: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class EventAck:
+class EventAck(Struct, frozen=True):
     """The receiver has stored the source's events up to this number."""
 
     KIND: ClassVar[int] = 11
@@ -216,8 +206,7 @@ class EventAck:
     number: int
 
 
-@dataclass(frozen=True, slots=True)
-class Subscribe:
+class Subscribe(Struct, frozen=True):
     """Send me events of these names from now on; replaces an earlier subscription. With `fresh`,
     latched events of the time before are not for me."""
 
@@ -226,8 +215,7 @@ class Subscribe:
     fresh: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(Struct, frozen=True):
     """A command to the node itself, not an action: `hold`, `release`, `stop` (stop routine of all
     devices), `status`, ..."""
 
@@ -239,8 +227,7 @@ class Command:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Struct, frozen=True):
     """Answer to a Command."""
 
     KIND: ClassVar[int] = 14
@@ -249,24 +236,21 @@ class Answer:
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Ping:
+class Ping(Struct, frozen=True):
     """Heartbeat."""
 
     KIND: ClassVar[int] = 15
     number: int
 
 
-@dataclass(frozen=True, slots=True)
-class Pong:
+class Pong(Struct, frozen=True):
     """Answer to a Ping."""
 
     KIND: ClassVar[int] = 16
     number: int
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
+class Tick(Struct, frozen=True):
     """Lock step: all envelopes that the sender sends to this receiver at this tick. It also marks
     the end of the tick."""
 
@@ -275,32 +259,28 @@ class Tick:
     envelopes: tuple[Any, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Bye:
+class Bye(Struct, frozen=True):
     """The sender closes the connection in an orderly way."""
 
     KIND: ClassVar[int] = 18
     text: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Challenge:
+class Challenge(Struct, frozen=True):
     """A server's answer to Hello when it has a key: its nonce."""
 
     KIND: ClassVar[int] = 19
     auth: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Proof:
+class Proof(Struct, frozen=True):
     """Answer to Challenge: proves that the client knows the key."""
 
     KIND: ClassVar[int] = 20
     auth: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class StreamOpen:
+class StreamOpen(Struct, frozen=True):
     """First message on a stream's own connection: one set point follows every `period` seconds."""
 
     KIND: ClassVar[int] = 21
@@ -311,8 +291,7 @@ class StreamOpen:
     it."""
 
 
-@dataclass(slots=True)
-class SetPoint:
+class SetPoint(Struct):
     """The newest set point of a stream, repeated every period as long as the sender wants it
     followed."""
 
@@ -327,8 +306,7 @@ class SetPoint:
     the delay."""
 
 
-@dataclass(frozen=True, slots=True)
-class Withdraw:
+class Withdraw(Struct, frozen=True):
     """The last set point must not be followed any longer; what comes next is of another run, or the
     first on this connection."""
 

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from enum import Enum
 from typing import Final
 from zlib import crc32
+
+from msgspec.structs import replace
 
 from petrobot.services.comm.protocol.codec import (
     LIMITS,

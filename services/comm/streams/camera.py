@@ -15,10 +15,10 @@ import re
 import socket
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.comm.protocol.security import is_loopback
@@ -53,8 +53,7 @@ class ImageFormatError(ValueError):
     """Bytes that are not an image or control of this format."""
 
 
-@dataclass(frozen=True, slots=True)
-class WireImage:
+class WireImage(Struct, frozen=True):
     """An image as it is sent: with its age (s since mid-exposure), never with a time of day."""
 
     generation: int

@@ -11,11 +11,11 @@ import os
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from petrobot.services.comm.streams.image import Image
@@ -32,8 +32,7 @@ OPEN_LIMIT = 10.0
 """Seconds for which `start` waits for the first image."""
 
 
-@dataclass(frozen=True, slots=True)
-class CaptureSettings:
+class CaptureSettings(Struct, frozen=True):
     """Settings of a camera. Zero, empty or None: the camera keeps its own setting."""
 
     fps: float = 0.0

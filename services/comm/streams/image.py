@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
+
+from msgspec import Struct
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 
-@dataclass(frozen=True, slots=True)
-class Image:
+class Image(Struct, frozen=True):
     """One exposure: `pixels` (height, width) uint8 grey levels, or (height, width, 3) blue green
     red with the key `colour = true`; `time` of mid-exposure on the receiver's clock (s).
 

@@ -16,8 +16,9 @@ import select
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, Protocol
+
+from msgspec import Struct
 
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -124,8 +125,7 @@ class Inlet:
             self._sink.withdraw()
 
 
-@dataclass(frozen=True, slots=True)
-class Incoming:
+class Incoming(Struct, frozen=True):
     """A stream that a receiver accepts: its period (s), the sink of its values, and the ticket that
     its sender must show."""
 
@@ -355,8 +355,7 @@ class StreamSender:
         self._again = again
 
 
-@dataclass(slots=True, eq=False)
-class _Guest:
+class _Guest(Struct, eq=False):
     line: StreamConnection
     since: float
     stream: str = ""

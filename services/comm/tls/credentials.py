@@ -15,10 +15,11 @@ import contextlib
 import hashlib
 import hmac
 import sys
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import COORDINATOR
@@ -41,8 +42,7 @@ RENEW_CA: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Credentials:
+class Credentials(Struct, frozen=True):
     """Credentials of one party.
 
     `key` is the shared key, or all accepted keys; `folder` holds the certificates, `party` names

@@ -15,9 +15,10 @@ import logging
 import socket
 import ssl
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
+
+from msgspec import Struct
 
 ACCEPTED: Final = 32
 """Connections accepted in one turn of the loop."""
@@ -27,8 +28,7 @@ PAUSE: Final = 0.05
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Admission:
+class Admission(Struct, frozen=True):
     """What a listener asks its owner."""
 
     protocol: Callable[[], asyncio.BaseProtocol]

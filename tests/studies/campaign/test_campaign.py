@@ -10,11 +10,11 @@ import json
 import os
 import signal
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
 from math import isfinite
 from pathlib import Path
 
 import pytest
+from msgspec.structs import asdict, replace
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.campaign import text_of

@@ -249,7 +249,7 @@ def test_scores_are_assigned_to_their_trials() -> None:
 
 def test_the_identity_of_a_campaign_does_not_depend_on_its_folder(toy_plan: CampaignPlan) -> None:
     """The same files in another folder are the same campaign."""
-    from dataclasses import replace
+    from msgspec.structs import replace
 
     assert identity(replace(toy_plan, task="/elsewhere.toml")) == identity(toy_plan)
     assert identity(replace(toy_plan, seed=2)) != identity(toy_plan)

@@ -4,10 +4,10 @@ after any interruption."""
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.studies.campaign.conduct import Campaign

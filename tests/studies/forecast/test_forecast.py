@@ -4,13 +4,13 @@ dependence, which the product rule does not."""
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from msgspec.structs import replace
 from scipy.stats import binom, norm
 
 from petrobot.coordinator.analysis.formats.netfile import NetFileError

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.time.completion import Completion, Slope, reliability_slopes
 from petrobot.coordinator.cli import main

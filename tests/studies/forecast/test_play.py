@@ -3,12 +3,12 @@ dead ends, each against values computed by hand."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.may_run import Cell
 from petrobot.coordinator.engine import (

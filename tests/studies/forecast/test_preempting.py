@@ -8,10 +8,10 @@ first one to end preempts the other.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.analysis.time.measured import is_cause
 from petrobot.coordinator.analysis.time.stochastic import stochastic_view

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from scipy.stats import rankdata, spearmanr
 
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
