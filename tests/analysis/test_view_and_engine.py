@@ -426,15 +426,20 @@ def test_a_ring_of_inhibitors_is_doubtful() -> None:
     assert doubt.startswith("move_a, move_b, move_c: each keeps the next one from firing")
 
 
-def test_the_time_of_one_of_several_ended_runs_is_doubtful() -> None:
+@pytest.mark.parametrize("end", ["normal", "preempt=success", "going"])
+def test_the_time_of_one_of_several_runs_is_doubtful(end: str) -> None:
+    """The engine starts the time again when the run that it belongs to has ended or was taken."""
     task = loads(
-        f'schema = 1\n[task]\nname = "t"\nfinal = "work == 0"\n{head("work")}[places]\n'
-        'work = { kind = "action", task = "work", servers = 2, tokens = 2 }\n[transitions]\n'
-        f"{arcs('late', 'work:normal', '', ', after = 2.0')}{arcs('bad', 'work:error', '')}",
+        f'schema = 1\n[task]\nname = "t"\nfinal = "work == 0 or late == 1"\n{head("work")}'
+        "[places]\n"
+        'work = { kind = "action", task = "work", tokens = 2 }\nlate = { }\n'
+        f"[transitions]\n{arcs('wait', f'work:{end}', 'late', ', after = 2.0')}"
+        f"{arcs('done', 'work:normal', '') if end != 'normal' else ''}"
+        f"{arcs('bad', 'work:error', '')}",
         "t.toml",
     )
     (doubt,) = stochastic_view(task).doubts
-    assert doubt.startswith("late: its time belongs to the run of work that ended first")
+    assert doubt.startswith("wait: its time belongs to the first run of work that it would take")
 
 
 def test_an_open_condition_of_a_timer_is_assumed_to_hold() -> None:

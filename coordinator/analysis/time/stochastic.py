@@ -954,11 +954,10 @@ class _Derivation:
         if self.compiled[t.name].never:
             return
         for arc in self.compiled[t.name].actions:
-            ended = arc.end in (End.NORMAL, End.ERROR)
-            if t.after is not None and ended and self._may_hold(arc.name, arc.weight + 1):
+            if t.after is not None and self._may_hold(arc.name, arc.weight + 1):
                 self.doubts.append(
-                    f"{t.name}: its time belongs to the run of {arc.name} that ended first, and "
-                    "the numbers do not tell the runs of a place apart"
+                    f"{t.name}: its time belongs to the first run of {arc.name} that it would "
+                    "take, and the numbers do not tell the runs of a place apart"
                 )
         cases = self._cases(t)
         for i, case in enumerate(cases):
