@@ -151,8 +151,7 @@ def inline_service(
         except ValueError as fault:
             text = f"what it returned cannot be sent: {fault}"
             return Outcome(call.id, Status.ERROR, {}, "bad_result", text)
-        outcome.cpu_seconds = time.process_time() - before
-        return outcome
+        return replace(outcome, cpu_seconds=time.process_time() - before)
 
     return answer
 

@@ -657,8 +657,8 @@ class Runner:
         self._outlets.close(identity)
         del self._runs[identity]
         # Not `now`: the action may have blocked since this step began.
-        result.seconds, result.cpu_seconds = self._clock() - run.started, run.cpu
-        self._reports.append(result)
+        took = self._clock() - run.started
+        self._reports.append(replace(result, seconds=took, cpu_seconds=run.cpu))
 
     def _hold(self, now: float, frozen: bool) -> None:
         """Freeze the runs, or let them continue with all their times shifted by the pause."""

@@ -3,12 +3,11 @@
 Every field is checked in both directions by the same rules, so a message that this side can encode
 is never refused by the other side.
 
-There are two code paths. `_Spec` describes every kind as a table built from the dataclass
-annotations. CALL, RESULT and SET POINT, which make up nearly all traffic, also have hand-written
-readers and writers (`READERS`, `WRITERS`) that produce the same bytes in a third of the time. A
-fast path only handles what is valid and ordinary; whatever it does not accept goes to the table,
-which finds the fault and words the error. So each rule is worded in one place, and tests compare
-the two paths.
+There are two code paths. `_Spec` describes every kind as a table built from its annotations. CALL,
+RESULT and SET POINT, which make up nearly all traffic, also have hand-written readers and writers
+(`READERS`, `WRITERS`) that produce the same bytes in a third of the time. A fast path only handles
+what is valid and ordinary; whatever it does not accept goes to the table, which finds the fault and
+words the error. So each rule is worded in one place, and tests compare the two paths.
 """
 
 from __future__ import annotations
