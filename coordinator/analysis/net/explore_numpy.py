@@ -7,8 +7,11 @@ The table maps a slot to the number of a marking. Keys are compared in full, so 
 words that follow from the others by invariants (`Layout.telling`) are computed for new markings
 only. What costs here is not computing but waiting for the memory: successors that equal another
 one of their block are found before the large table is asked, the table holds nothing but numbers of
-32 bits, so that it stays in the cache for long, and the growing arrays are moved by pages, not
-copied.
+32 bits, so that it stays in the cache for long, and the growing arrays of keys are moved by pages,
+not copied.
+
+The successors of a block stand last one first. Of several that claim one slot, numpy's assignment
+then keeps the one that was found first.
 """
 
 from __future__ import annotations
@@ -51,6 +54,7 @@ class NumpyEngine:
     def __init__(self, begun: Explored) -> None:
         """Continue a search that any engine began."""
         self._net, self._keep = begun.net, begun.keep_edges
+        self._shift = max(0, len(self._net.transitions) - 1).bit_length()
         self._states, self._expanded = len(begun.words), len(begun.row) - 1
         self._edges = int(begun.row[-1])
         self._row = Column(begun.row)
@@ -62,7 +66,7 @@ class NumpyEngine:
         """Rebuild everything that depends on the layout."""
         self._layout = layout
         self._rules = Rules.compiled(self._net, layout)
-        self._keys = [Column(words[:, w].copy()) for w in range(layout.words)]
+        self._keys = [Column(words[:, w]) for w in range(layout.words)]
         self._telling = self._keys[: layout.telling]
         self._table = np.full(0, EMPTY, dtype=np.int32)
         self._near = np.zeros(NEAR, dtype=np.int32)
@@ -95,34 +99,37 @@ class NumpyEngine:
         stop = min(self._states, self._expanded + block)
         able = self._enabled(stop)
         degree = able.view(np.uint8).sum(axis=0, dtype=np.int64)
-        source = np.repeat(np.arange(self._expanded, stop), degree)
-        label = np.flatnonzero(able.T.ravel())
-        label -= np.repeat(np.arange(0, (stop - self._expanded) * transitions, transitions), degree)
+        flat = np.flatnonzero(able.T.ravel())[::-1]
+        source = (flat >> self._shift) + self._expanded
+        label = flat & ((1 << self._shift) - 1)
         self._reserve(len(label))
         new, telling = label[:0], self._layout.telling
         overflown = self._fire(range(telling), source, label)
         if not overflown:
             target, new = self._intern(len(label))
-            overflown = self._fire(range(telling, len(self._keys)), source[new], label[new])
+            overflown = self._fire(
+                range(telling, len(self._keys)), _at(source, new), _at(label, new)
+            )
         if overflown:
             words = self._words()
             wider = widened_layout(self._layout, overflown)
             self._use(wider, self._layout.repack(words, wider))
             return True
         self._states += len(new)
-        self._commit(degree, label, target, cap)
+        self._commit(degree, label[::-1], target[::-1], cap)
         return self._expanded < self._states
 
     def _words(self) -> Words:
         return np.stack([key.values[: self._states] for key in self._keys], axis=1)
 
     def _enabled(self, stop: int) -> NDArray[np.bool_]:
-        """Return which transitions the markings of the block enable, shape (transitions, block)."""
+        """Return which transitions the markings of the block enable, shape (transitions, filled up
+        to a power of two; block)."""
         guarded = [
             key.values[self._expanded : stop] | guard
             for key, guard in zip(self._keys, self._layout.guard_words, strict=True)
         ]
-        able = np.zeros((len(self._net.transitions), stop - self._expanded), dtype=np.bool_)
+        able = np.zeros((1 << self._shift, stop - self._expanded), dtype=np.bool_)
         for t in self._rules.able:
             able[t] = True
             for word, sub, guard, want in self._rules.word_tests[t]:
@@ -167,7 +174,7 @@ class NumpyEngine:
         # More than half of the successors equal an earlier one of their block. A table that stays
         # in the cache finds most of these: it holds the first successor that hashes to a slot.
         near = slot & (NEAR - 1)
-        self._near[near[::-1]] = every[::-1]
+        self._near[near] = every
         first = _at(self._near, near)
         own = [key.values[n : n + m] for key in self._telling]
         differ = np.zeros(m, dtype=np.bool_)
@@ -175,7 +182,8 @@ class NumpyEngine:
             differ |= _at(key, first) != key
         single = np.flatnonzero(differ | (first == every))
         number, new, taken = self._probe(single, _at(slot, single))
-        order = np.argsort(new, kind="stable")  # a few sorted runs, one of each round: merged fast
+        # A few sorted runs, one of each round, which a stable sort merges fast.
+        order = np.argsort(new, kind="stable")[::-1]
         new = _at(new, order)
         rank = np.empty(m, dtype=np.int32)
         rank[new] = np.arange(n, n + len(new), dtype=np.int32)
@@ -194,22 +202,23 @@ class NumpyEngine:
     ) -> tuple[Numbers, NDArray[np.int64], NDArray[np.int64]]:
         """Find or claim a table slot for each of these successors.
 
-        Return (number of each one, which successors are new, their slots). Linear probing in
-        rounds: every successor that is still waiting looks at its next slot. Successor k counts as
-        marking n + k until it is known to be new. If several want the same empty slot, the first
-        one gets it (assignment in reversed order, since numpy keeps the last). Equal successors
-        probe the same slots in the same rounds, so the first of them becomes the new marking.
+        Return (number of each one, which successors are new, their slots). Probing in rounds: every
+        successor that is still waiting looks one slot further on, then two, three, and so on.
+        Successor k counts as marking n + k until it is known to be new. If several want the same
+        empty slot, the one that was found first gets it. Equal successors probe the same slots in
+        the same rounds, so the first of them becomes the new marking.
         """
         n, table, mask = self._states, self._table, len(self._table) - 1
         number, at = np.empty(len(waiting), dtype=np.int32), np.arange(len(waiting))
         own = [_at(key.values[n:], waiting) for key in self._telling]
-        new, taken = [waiting[:0]], [slot[:0]]
+        new, taken, step = [waiting[:0]], [slot[:0]], 0
         while len(waiting):
+            step += 1
             found = _at(table, slot)
             empty = np.flatnonzero(found < 0)
             if len(empty):
                 free, wanted = _at(slot, empty), (n + _at(waiting, empty)).astype(np.int32)
-                table[free[::-1]] = wanted[::-1]
+                table[free] = wanted
                 got = _at(table, free)
                 found[empty] = got
                 won = np.flatnonzero(got == wanted)
@@ -220,7 +229,7 @@ class NumpyEngine:
             for key, mine in zip(self._telling, own, strict=True):
                 differ |= _at(key.values, found) != mine
             lost = np.flatnonzero(differ)
-            at, waiting, slot = _at(at, lost), _at(waiting, lost), (_at(slot, lost) + 1) & mask
+            at, waiting, slot = _at(at, lost), _at(waiting, lost), (_at(slot, lost) + step) & mask
             own = [_at(key, lost) for key in own]
         return number, np.concatenate(new), np.concatenate(taken)
 
@@ -270,12 +279,13 @@ class NumpyEngine:
         for start in range(0, self._states, SUCCESSORS):
             stop = min(start + SUCCESSORS, self._states)
             waiting = np.arange(start, stop, dtype=np.int32)
-            slot = self._slots(start, stop)
+            slot, step = self._slots(start, stop), 0
             while len(waiting):
+                step += 1
                 empty = np.flatnonzero(_at(self._table, slot) < 0)
                 self._table[_at(slot, empty)] = _at(waiting, empty)
                 lost = np.flatnonzero(_at(self._table, slot) != waiting)
-                waiting, slot = _at(waiting, lost), (_at(slot, lost) + 1) & mask
+                waiting, slot = _at(waiting, lost), (_at(slot, lost) + step) & mask
 
     def explored(self) -> Explored:
         """Return the search so far."""
@@ -294,7 +304,8 @@ class NumpyEngine:
 
 
 class Column:
-    """A growing array. Growing moves pages, not values, where the system can (mremap)."""
+    """A growing array. Growing moves pages, not values, where the system can (mremap), so it grows
+    by little: numpy fills the new room with zeros, which costs more than moving."""
 
     def __init__(self, values: NDArray[Any]) -> None:
         """Begin with a copy of these values."""
@@ -306,7 +317,7 @@ class Column:
         if wanted > len(self.values):
             if not self.values.flags.owndata:
                 self.values = self.values.copy()
-            self.values.resize(max(wanted, int(1.5 * len(self.values)), 1024), refcheck=False)
+            self.values.resize(max(wanted, len(self.values) * 9 // 8, 1024), refcheck=False)
 
     def append(self, more: NDArray[Any]) -> None:
         """Add values at the end."""
