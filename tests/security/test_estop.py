@@ -468,6 +468,59 @@ async def test_a_file_that_was_edited_in_mid_run_does_not_keep_a_stop_from_its_n
         assert found[0] == 0 and re.search("^pc +axis +cleared$", found[1], re.M), found
 
 
+@asynccontextmanager
+async def breaking(far: int, way: str, piece: int) -> AsyncIterator[int]:
+    """Carry the bytes of connections to a port of this host. The first connection breaks before
+    this piece (1, 2, ...) of what goes `up` to the node or `down` from it."""
+    pairs: list[asyncio.Task[object]] = []
+
+    async def carry(
+        reader: asyncio.StreamReader, writer: asyncio.StreamWriter, breaks: bool
+    ) -> None:
+        pieces = 0
+        while data := await reader.read(1 << 16):
+            pieces += 1
+            if breaks and pieces == piece:
+                writer.transport.abort()
+                return
+            writer.write(data)
+        writer.close()
+
+    async def join(near: asyncio.StreamReader, to_near: asyncio.StreamWriter) -> None:
+        first = not pairs
+        far_end, to_far = await asyncio.open_connection("127.0.0.1", far)
+        up = carry(near, to_far, first and way == "up")
+        down = carry(far_end, to_near, first and way == "down")
+        pairs.extend((asyncio.create_task(up), asyncio.create_task(down)))
+        await asyncio.wait(pairs[-2:], return_when=asyncio.FIRST_COMPLETED)
+        to_near.transport.abort()
+        to_far.transport.abort()
+
+    server = await asyncio.start_server(join, "127.0.0.1", 0)
+    try:
+        yield int(server.sockets[0].getsockname()[1])
+    finally:
+        server.close()
+        await asyncio.gather(*pairs, return_exceptions=True)
+    assert len(pairs) > 2, "it never broke"
+
+
+@pytest.mark.parametrize("way", ["up", "down"])
+@pytest.mark.parametrize("piece", [1, 2])
+async def test_a_stop_is_given_again_when_its_connection_breaks(
+    tmp_path: Path, way: str, piece: int
+) -> None:
+    """It broke after the node had accepted it, and the stop was not repeated: a node on another
+    host was left as it was."""
+    cell = tmp_path / "services.toml"
+    cell.write_text(ONE_NODE.format(*free_ports(1)))
+    async with node_of(cell), breaking(load(cell).nodes["pc"].port, way, piece) as port:
+        there = tmp_path / "there.toml"
+        there.write_text(ONE_NODE.format(port))
+        (answer,) = await order_all(load(there))
+        assert answer.answered and answer.done and answer.devices == {"axis": "stopped"}, answer
+
+
 async def test_a_stop_that_was_kept_for_a_node_with_another_copy_of_its_file_is_cleared(
     tmp_path: Path, command: Command
 ) -> None:
