@@ -20,14 +20,7 @@ from typing import Any
 from msgspec import Struct, field
 
 from petrobot.coordinator.run.supervisor import is_local
-from petrobot.services.comm.calls.caller import (
-    LOST,
-    UNREACHABLE,
-    Caller,
-    Notice,
-    Patience,
-    PeerLost,
-)
+from petrobot.services.comm.calls.caller import Caller, Notice, Patience, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.link import in_thread
 from petrobot.services.comm.location_file import Directory
@@ -138,8 +131,6 @@ class EmergencyLine:
         self.why = ""
         self.note = ""
         self.reached = False
-        self.cut = False
-        """Whether the connection broke before the last order was answered."""
         self._name = name
         self._numbers = 0
         self._device_names = frozenset(directory.devices)
@@ -152,13 +143,12 @@ class EmergencyLine:
             key=proves.key,
             tls=proves.client(),
         )
-        self.client.start()
 
     async def connect(self, timeout: float) -> bool:
-        """Wait at most this time (s) for the connection; return whether the node accepted it,
-        otherwise `why` has the reason."""
-        up = await self.client.connected(timeout)
-        self.reached = self.reached or up
+        """Connect within this time (s); return whether the node accepted, otherwise `why` has the
+        reason."""
+        self.client.start()
+        up = self.reached = await self.client.connected(timeout)
         if not up and not self.why:
             said = self.client.trouble if self.client.answered else ""
             trouble = f": {said}" if said else ""
@@ -186,9 +176,7 @@ class EmergencyLine:
         answers = data.get("answers")
         if isinstance(answers, Mapping):
             return {str(device): str(answer) for device, answer in answers.items()}
-        self.cut = data.get("cause") in (LOST, UNREACHABLE)
-        if not self.cut:  # else `why` says how it broke
-            self.why = str(data.get("text") or data.get("cause") or "an empty answer")
+        self.why = str(data.get("text") or data.get("cause") or "an empty answer")
         return None
 
     def devices_of(self, answers: Mapping[str, str]) -> dict[str, str]:
@@ -282,26 +270,24 @@ async def _answered(stopped: Stopped, asking: asyncio.Task[None]) -> None:
 
 
 async def _ask(line: EmergencyLine | None, stopped: Stopped, verb: str) -> None:
-    """Repeat the order until all devices stand still, over a new connection if one breaks;
-    `seconds` is the time of the first answer."""
+    """Repeat the order until all devices stand still; `seconds` is the time of the first answer."""
     if line is None:
         return
     loop = asyncio.get_running_loop()
     begun = loop.time()
-    while await line.connect(max(0.0, begun + STANDSTILL - loop.time())):
-        answers = await line.order(verb, STORED)
-        if answers is None:
-            if line.cut:
-                continue
-            break
-        if stopped.seconds is None:
-            stopped.seconds = loop.time() - begun
-            begun = loop.time()  # its devices may have stopped while it wrote
-        stopped.devices, stopped.note = line.devices_of(answers), line.note or stopped.note
-        stopped.open = [d for d, said in stopped.devices.items() if said not in _DONE[verb]]
-        if "stopping" not in stopped.devices.values() or loop.time() - begun > STANDSTILL:
-            return
-        await asyncio.sleep(ASK_AGAIN)
+    if await line.connect(STANDSTILL):
+        while True:
+            answers = await line.order(verb, STORED)
+            if answers is None:
+                break
+            if stopped.seconds is None:
+                stopped.seconds = loop.time() - begun
+                begun = loop.time()  # its devices may have stopped while it wrote
+            stopped.devices, stopped.note = line.devices_of(answers), line.note or stopped.note
+            stopped.open = [d for d, said in stopped.devices.items() if said not in _DONE[verb]]
+            if "stopping" not in stopped.devices.values() or loop.time() - begun > STANDSTILL:
+                return
+            await asyncio.sleep(ASK_AGAIN)
     stopped.why = line.why
 
 

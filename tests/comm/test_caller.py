@@ -455,13 +455,37 @@ def test_every_command_is_answered_even_after_a_fault() -> None:
     caller.advance(2.0)
     assert caller.notices() == [m.Answer(id_, False, {"cause": "no_answer"}) for id_ in "bc"]
     caller.command(3.0, m.Command("d", "hold"))
-    caller.link_down(3.1, "cut")
+    caller.link_down(3.1, "cut", final=True)
     caller.command(3.2, m.Command("e", "hold"))
     answers = [notice for notice in caller.notices() if isinstance(notice, Answer)]
     assert answers == [
         m.Answer("d", False, {"cause": "lost"}),
         m.Answer("e", False, {"cause": "unreachable"}),
     ]
+
+
+def test_a_command_waits_for_a_lost_connection_and_is_sent_again() -> None:
+    """It was given up with its connection: a paused robot moved on, or stayed held although its
+    task continued."""
+    caller = _caller()
+    orders = [m.Command("1", "hold"), m.Command("2", "release"), m.Command("3", "status")]
+    caller.command(0.0, orders[0])
+    assert caller.messages() == orders[:1]
+    caller.command(0.1, orders[1])
+    caller.link_down(0.1, "cut")
+    caller.command(0.2, orders[2])
+    assert caller.messages() == []
+    caller.link_up(0.5, _welcome("n1"))
+    assert caller.messages() == orders
+    caller.receive(0.6, m.Answer("1", True, {}))
+    caller.receive(0.6, m.Answer("2", True, {}))
+    caller.link_down(0.7, "cut")
+    caller.link_up(0.8, _welcome("n2"))
+    assert caller.messages() == orders[2:], "the new process has not had it"
+    caller.link_down(0.9, "cut")
+    caller.notices()
+    caller.advance(3.0)
+    assert caller.notices() == [m.Answer("3", False, {"cause": "lost"})]
 
 
 @pytest.mark.parametrize("auto_ack", [True, False])

@@ -238,13 +238,17 @@ class PeerAbsence:
         self._refusal, self.until = f"{self._peer} refuses the connection: {code}: {text}", NEVER
         return CallEnd(REFUSED, self._refusal)
 
+    def waits(self, now: float) -> bool:
+        """Whether what is sent now waits for a connection."""
+        return now < self.until < NEVER
+
     def new_call(self, now: float) -> CallEnd | None:
         """Return how a new call ends at once; None if it waits.
 
         A call that follows a failed one too soon waits: a task that repeats a failed call at once
         must not loop as fast as the machine can, nor use up all its tries before the peer is back.
         """
-        if now < self.until < NEVER:
+        if self.waits(now):
             return None
         text = self._refusal or self._with_trouble(f"{self._peer} is not connected")
         away = CallEnd(REFUSED if self._refusal else UNREACHABLE, text)
@@ -410,7 +414,7 @@ class Caller:
         self._pending = PendingCalls()
         self.pending: Collection[str] = self._pending.keys()
         """Ids of the calls without a result."""
-        self._commands: dict[str, float] = {}
+        self._commands: dict[str, tuple[float, m.Command]] = {}
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
         self._settled = FinishedCalls(self.patience.acknowledge)
@@ -540,13 +544,18 @@ class Caller:
             self.cancel(now, id_, reason)
 
     def command(self, now: float, command: m.Command) -> None:
-        """Send a command to the node. Raises NotPlainError for data that no message can carry."""
-        if not self.up:
+        """Send a command to the node; as a call, it waits for a connection that is being tried,
+        and is sent again under its id after each reconnection until it is answered. Raises
+        NotPlainError for data that no message can carry."""
+        command = replace(command, data=plain(command.data, "data"))
+        if not self.up and not self._absence.waits(now):
             self._no_answer(command.id, UNREACHABLE)
             return
-        self._commands[command.id] = now + self.patience.answer
-        self.soonest = min(self.soonest, now + self.patience.answer)
-        self._messages.append(replace(command, data=plain(command.data, "data")))
+        due = now + self.patience.answer
+        self._commands[command.id] = due, command
+        self.soonest = min(self.soonest, due)
+        if self.up:
+            self._messages.append(command)
 
     def subscribe(self, now: float, names: Iterable[str], *, fresh: bool = False) -> None:
         """Subscribe to these events, also after each reconnection; replaces an earlier
@@ -597,6 +606,7 @@ class Caller:
             self._send(now, pending)
             if pending.cancel is not None:
                 self._messages.append(m.Cancel(pending.call.id, pending.cancel))
+        self._messages.extend(command for _, command in self._commands.values())
         self._settle_again(now, welcome.runs)
 
     def _forget_boot(self) -> None:
@@ -627,8 +637,6 @@ class Caller:
         self._messages.clear()
         self._settled.link_lost()
         self._notices.append(PeerLost(reason))
-        for id_ in list(self._commands):
-            self._no_answer(id_, LOST)
         if final:
             self._end_all(LOST, reason)
         else:
@@ -651,8 +659,6 @@ class Caller:
         self._messages.clear()
         if was_up or self._pending or self._commands:
             self._notices.append(PeerLost(away.text))
-        for id_ in list(self._commands):
-            self._no_answer(id_, REFUSED)
         self._end_all(*away)
 
     def receive(self, now: float, message: m.Message) -> None:
@@ -732,7 +738,7 @@ class Caller:
         the peer, perhaps on the same host, may have stood still, too."""
         until = at + self.patience.accept
         self._pending.postpone(until)
-        self._commands = {id_: max(due, until) for id_, due in self._commands.items()}
+        self._commands = {id_: (max(due, until), c) for id_, (due, c) in self._commands.items()}
 
     def advance(self, now: float) -> None:
         """End the calls that have waited too long."""
@@ -748,13 +754,13 @@ class Caller:
                 )
         for id_ in self._pending.not_answered(now):
             self._give_up(id_, "no_answer", f"{self.peer} sent no result in time")
-        for id_ in [id_ for id_, due in self._commands.items() if due <= now]:
+        for id_ in [id_ for id_, (due, _) in self._commands.items() if due <= now]:
             self._no_answer(id_, "no_answer")
 
     def due(self) -> float | None:
         """Return when `advance` must be called next (s), None if never."""
         waits = (self._pending.due(), self._settled.due, self._absence.until)
-        self.soonest = soonest = min(*waits, *self._commands.values())
+        self.soonest = soonest = min(*waits, *(due for due, _ in self._commands.values()))
         return soonest if soonest < NEVER else None
 
     @property
@@ -807,6 +813,8 @@ class Caller:
         for id_, pending in list(self._pending.items()):
             its = UNREACHABLE if cause == LOST and not pending.sent else cause
             self._end(id_, its, text, m.Executed.UNKNOWN if pending.sent else pending.if_unsent)
+        for id_ in list(self._commands):
+            self._no_answer(id_, cause)
 
     def _end(self, id_: str, cause: str, text: str, executed: m.Executed) -> None:
         pending = self._pending.pop(id_)
