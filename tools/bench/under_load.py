@@ -4,8 +4,9 @@
     python -m tools.bench.under_load 5 tests/cli   those of a folder (further arguments go to
                                                    pytest)
 
-Each round runs beside one busy process per core, and has a time limit. The output of pytest is kept
-in reports/under_load. Exit code 1 if a test failed in any round, or a round reached its limit.
+Each round runs three tests at a time per core, which mostly wait, beside one busy process per core,
+and has a time limit. The output of pytest is kept in reports/under_load. Exit code 1 if a test
+failed in any round, or a round reached its limit.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
         "-m",
         "pytest",
         "-n",
-        "2",
+        str(3 * (os.cpu_count() or 1)),
         "-m",
         "processes and not proof",
         f"--junitxml={report}",
