@@ -299,13 +299,14 @@ class Progress(Struct, frozen=True, dict=True):
         else:
             reason = hopeless if only_gives_up else reason
             goes_on = f"the task can continue for ever, but never reaches {final}"
+        later = (f"later, with {left_over(x, state)}:",) if state != first else ()
         goes_on = goes_on if still else "nothing else can happen"
         if tired[first]:
             leaves = np.isin(x.source, lost) & ~np.isin(x.target, lost) & ~x.fails
             fired = {name for n in np.unique(x.label[leaves]) for name in x.steps[n].firings}
             ways = sorted(self._stops & fired)
             goes_on += f"; only {few(ways) if ways else 'a further error'} ends it"
-        return self._no(reason, first, (*self._awaited(inside), *why.details, goes_on))
+        return self._no(reason, first, (*self._awaited(inside), *later, *why.details, goes_on))
 
     def _awaited(self, states: Mask) -> tuple[str, ...]:
         """Return for which runs the task waits where an end holds in one of these states."""
