@@ -867,6 +867,19 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     assert "because `ask` takes it first" in found.reason
 
 
+def test_a_transition_that_never_fires_names_who_goes_first_by_priority() -> None:
+    """Its tokens are left there only where the task has given up: that bars it, and is no cause."""
+    net: dict[str, dict[str, Any]] = {
+        "easy": {"in": "jobs arm !dead", "out": "pick", "priority": 1},
+        "hard": {"in": "jobs arm !dead", "out": "pick"},
+        "picked": {"in": "pick:normal", "out": "arm"},
+        "broke": {"in": "pick:error", "out": "arm dead"},
+    }
+    task = make_task("jobs=2 arm~=1 pick! dead", net, final="jobs == 0 and arm == 1 and dead == 0")
+    found = judged(replace(task, final_error=parse("dead > 0"))).quasi_live
+    assert found.reason == "hard can never fire: whenever it could, `easy` goes first, by priority"
+
+
 @pytest.mark.parametrize("reset", [False, True])
 def test_a_counter_that_nothing_resets_is_why_there_is_no_way_back(reset: bool) -> None:
     """The work is back after `fixed`, but the third error will be the last one."""
