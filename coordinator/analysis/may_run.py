@@ -344,6 +344,8 @@ def _awaited_ends(task: Task, x: ExecutionGraph) -> Iterator[Finding]:
     for name in found:
         takers = [t for t in flat.transitions.values() if name in _places(t)]
         events = {e for t in takers for e in t.events if flat.events[e].scope is Scope.EXTERNAL}
+        if not events:  # nothing ever takes its token, or nothing can: `sound` says so
+            continue
         text = f"the end needs the event {listed(events)}, as only that empties this place"
         remedy = "write `listen = true` here if it need not come"
         yield Finding(Severity.NOTE, "awaited-end", f"places.{name}", text, remedy)

@@ -167,3 +167,42 @@ def test_an_end_that_waits_for_an_event_is_noted(listen: str, told: int) -> None
     notes = found(text, "awaited-end")
     assert [(one.key, "button" in one.text) for one in notes] == [("places.listening", True)] * told
     assert all("listen = true" in one.remedy for one in notes)
+
+
+@pytest.mark.parametrize(
+    ("lost", "tokens", "told"),
+    [
+        (', out = ["lost"]', 0, "lost: filled by `slipped`, and no transition takes it"),
+        ("", 1, "lost: from the beginning, and no transition takes it"),
+    ],
+    ids=["filled", "from the beginning"],
+)
+def test_a_place_that_nothing_empties_does_not_wait_for_an_event(
+    lost: str, tokens: int, told: str
+) -> None:
+    """The note said "the end needs the event none", where another branch waits for one."""
+    text = f"""
+schema = 1
+[task]
+name = "loose"
+final = "parts == 0"
+[events]
+button = {{ memory = "latched", early = "keep" }}
+[primitive_tasks]
+grip = {{ deadline = 2.0 }}
+[places]
+parts = {{ kind = "control", tokens = 2 }}
+grip = {{ kind = "action" }}
+lost = {{ tokens = {tokens} }}
+waiting = {{ tokens = 1, listen = true }}
+[transitions]
+next = {{ in = ["parts", "!grip"], out = ["grip"] }}
+gripped = {{ in = ["grip:normal"] }}
+slipped = {{ in = ["grip:error"]{lost} }}
+pressed = {{ in = ["waiting"], out = ["waiting"], event = "button" }}
+"""
+    assert not found(text, "awaited-end")
+    analysis = may_run(loads(text), None, Budget()).analysis
+    assert analysis is not None
+    sound = analysis.verdicts()["sound"]
+    assert not sound.holds and told in sound.details, sound

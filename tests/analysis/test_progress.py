@@ -593,7 +593,8 @@ def test_a_stop_button_whose_token_others_need_does_not_hide_what_is_stuck(reset
     )
     found = judged(task)
     assert found.deadlock_free.holds and found.sound.holds is False
-    assert found.sound.details[0].startswith("the end asks for held == 0")
+    later, asked, *_ = found.sound.details
+    assert later.startswith("later, with ") and asked.startswith("the end asks for held == 0")
     assert found.sound.details[-1] == "nothing else can happen; only halt ends it"
 
 
@@ -864,6 +865,19 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     found = judged(make_task("jobs=1 head~=1 poll!", net, final="jobs == 0")).quasi_live
     assert found.reason.startswith("clean can never fire: in every state at rest it needs head")
     assert "because `ask` takes it first" in found.reason
+
+
+def test_a_transition_that_never_fires_names_who_goes_first_by_priority() -> None:
+    """Its tokens are left there only where the task has given up: that bars it, and is no cause."""
+    net: dict[str, dict[str, Any]] = {
+        "easy": {"in": "jobs arm !dead", "out": "pick", "priority": 1},
+        "hard": {"in": "jobs arm !dead", "out": "pick"},
+        "picked": {"in": "pick:normal", "out": "arm"},
+        "broke": {"in": "pick:error", "out": "arm dead"},
+    }
+    task = make_task("jobs=2 arm~=1 pick! dead", net, final="jobs == 0 and arm == 1 and dead == 0")
+    found = judged(replace(task, final_error=parse("dead > 0"))).quasi_live
+    assert found.reason == "hard can never fire: whenever it could, `easy` goes first, by priority"
 
 
 @pytest.mark.parametrize("reset", [False, True])

@@ -244,6 +244,12 @@ IN_THE_TASK: list[Mistake] = [
     ),
     (
         TASK,
+        '["grip:error"] }',
+        """["grip:error"], when = "grip.reason != 'sliped'" }""",
+        r":LINE: transitions.lost.when: no action of grip ends with the cause 'sliped'.*'slipped'",
+    ),
+    (
+        TASK,
         '["carry:normal"] }',
         '["carry:normal", nothing] }',
         r":LINE: not valid TOML: nothing is a text without quotes",
@@ -875,7 +881,22 @@ TYPED = '[variables.w]\ntype = "float"\n\n[places]'
 MEMORY = '[services.memory]\nnode = "pc"\n\n[actions]'
 READS = (CODE, "await ctx.sleep(0.3)", 'print(await ctx.get("part"))', "")
 
+
+def by_cause(cause: str) -> Mistake:
+    """Errors of `grip` are told apart by their cause."""
+    lost = """lost = { in = ["grip:error"], when = "grip.reason == 'CAUSE'" }
+others = { in = ["grip:error"], out = ["broken"], when = "grip.reason != 'CAUSE'" } #"""
+    return (TASK, 'lost = { in = ["grip:error"] }', lost.replace("CAUSE", cause), "")
+
+
 DOUBTED: list[tuple[list[Mistake], str, list[Mistake]]] = [
+    (
+        [by_cause("jammed")],
+        r":\d+: transitions.lost.when: no action of grip ends with the cause 'jammed'",
+        [(CODE, 'error("slipped"', 'error(ctx.device.state.get("fault", "slipped")', "")],
+    ),
+    ([by_cause("slipped")], "", []),
+    ([by_cause("device_fenced")], "", []),
     (
         [(TASK, "move = { ", 'move = { cost = "value:way", ', "")],
         "primitive_tasks.move.cost: the action 'move' returns no value 'way'",

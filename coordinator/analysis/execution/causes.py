@@ -581,7 +581,10 @@ def _came(net: Net, firings: tuple[str, ...], place: int) -> Iterator[str]:
     for name in firings:
         change = dict(net.compiled.changes[net.transition_index[name]]).get(place, 0)
         (gave if change > 0 else took)[name] += abs(change)
+    taken_out = any(dict(changes).get(place, 0) < 0 for changes in net.compiled.changes)
     if not +gave:
+        if not taken_out:
+            yield "from the beginning, and no transition takes it"
         return
     if net.initial[place]:
         taken, back = (
@@ -589,7 +592,6 @@ def _came(net: Net, firings: tuple[str, ...], place: int) -> Iterator[str]:
         )
         yield f"taken: {taken or 'none'}; returned: {back}"
         return
-    taken_out = any(dict(changes).get(place, 0) < 0 for changes in net.compiled.changes)
     by = " and ".join(f"`{name}`" for name in +gave)
     yield f"filled by {by}{', and no transition takes it' * (not taken_out)}"
 

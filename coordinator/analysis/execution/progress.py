@@ -299,13 +299,14 @@ class Progress(Struct, frozen=True, dict=True):
         else:
             reason = hopeless if only_gives_up else reason
             goes_on = f"the task can continue for ever, but never reaches {final}"
+        later = (f"later, with {left_over(x, state)}:",) if state != first else ()
         goes_on = goes_on if still else "nothing else can happen"
         if tired[first]:
             leaves = np.isin(x.source, lost) & ~np.isin(x.target, lost) & ~x.fails
             fired = {name for n in np.unique(x.label[leaves]) for name in x.steps[n].firings}
             ways = sorted(self._stops & fired)
             goes_on += f"; only {few(ways) if ways else 'a further error'} ends it"
-        return self._no(reason, first, (*self._awaited(inside), *why.details, goes_on))
+        return self._no(reason, first, (*self._awaited(inside), *later, *why.details, goes_on))
 
     def _awaited(self, states: Mask) -> tuple[str, ...]:
         """Return for which runs the task waits where an end holds in one of these states."""
@@ -471,10 +472,28 @@ class Progress(Struct, frozen=True, dict=True):
         if always:
             text = f"in every state at rest it {', and '.join(sorted(always))}"
             return text + self._first_takers(t, idle, len(always) > 1)
+        if first := self._outranking(t):
+            verb = "goes" if len(first) == 1 else "go"
+            return f"whenever it could, {' and '.join(first)} {verb} first, by priority"
         if near:
             return f"when its tokens are there, it {' or '.join(sorted(set.union(*near)))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
         return f"in no state at rest are the tokens that it needs ({needs}) there together"
+
+    def _outranking(self, t: CompiledTransition) -> list[str]:
+        """Return the transitions that ask for no more than this one, and go first."""
+        needs, bars = dict(t.needs), dict(t.bars)
+        ends = {arc.place: arc.end for arc in t.actions}
+        return [
+            f"`{u.name}`"
+            for u in self.x.engine.compiled.transitions
+            if u.rank < t.rank
+            if u.after is None and not (u.pulse or u.flags or any(a.raised for a in u.actions))
+            if u.when is None or u.when == t.when
+            if all(needs.get(p, 0) >= w for p, w in u.needs)
+            if all(bars.get(p, most + 1) <= most for p, most in u.bars)
+            if all(ends.get(arc.place) is arc.end for arc in u.actions)
+        ]
 
     def _never_true(self, t: CompiledTransition) -> str:
         """Return that its condition is false for all values that its variables ever have; empty if

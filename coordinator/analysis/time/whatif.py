@@ -94,6 +94,12 @@ def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tu
             continue
         for key in _other_estimate(task, runs, change):
             said.setdefault(key, []).append(change.text)
+            if change.subject[-1] == "mean" and (by := measured.preempted.get(key)):
+                raise change.fault(
+                    f"how often {' and '.join(by)} would preempt such runs of {key[0]}, the "
+                    "stochastic view does not know",
+                    "`petrobot forecast --estimates CAMPAIGN --what-if` simulates it",
+                )
             if change.subject[-1] == "share":
                 shares.setdefault(key, {})[Status(change.subject[-2])] = change
             elif Status.ERROR in statuses_of(task, change)[2]:  # it is of all these ends

@@ -4,7 +4,7 @@ the simulated net; and the product rule for comparison."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,10 +33,11 @@ from petrobot.coordinator.studies.forecast.distributions import (
     dependences,
     siblings,
 )
-from petrobot.coordinator.studies.forecast.history import CENSORED, Codes, Training, Values
+from petrobot.coordinator.studies.forecast.history import CENSORED, Codes, Runs, Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import (
+    NEGLIGIBLE,
     branch_doubts,
     chosen_so,
     condition_doubts,
@@ -333,7 +334,7 @@ def _from_net(
 ) -> dict[str, Any]:
     net = _SimulatedNet(training)
     tested = training if training.repeats else training.earlier
-    residual = []
+    residual, runs = [], training.runs
     if tested is not None:
         known = net if tested is training else _SimulatedNet(tested)
         residual = residuals(tested, known.replayed(request.seed))
@@ -356,6 +357,7 @@ def _from_net(
         "law": {**law, "trials": float(n)},
         "doubts": [
             *doubts(residual, whole, request.point),
+            *_what_if_doubts(training, runs),
             *event_doubts(training),
             *condition_doubts(training, net.structure.moves),
             *branch_doubts(
@@ -421,6 +423,21 @@ def _reshared(training: Training, changes: Sequence[Change]) -> set[str]:
     """Return the primitive tasks whose runs end otherwise."""
     shares = [change for change in changes if change.subject[-1] == "share"]
     return {statuses_of(training.task, change)[0].name for change in shares}
+
+
+def _what_if_doubts(training: Training, runs: Runs) -> Iterator[str]:
+    """Yield in words where changed runs end by themselves later than any measured run did."""
+    was, names = training.runs, training.vocabulary
+    freed = was.preempted & ~was.censored & ~runs.preempted
+    for q in np.unique(was.place[freed]).tolist():
+        own = (was.place == q) & ~was.preempted
+        beyond = freed & (was.place == q) & (was.took >= was.took[own].max(initial=0.0))
+        share = len(np.unique(was.trial[beyond])) / max(1, len(np.unique(was.trial)))
+        if share > NEGLIGIBLE:
+            yield (
+                f"in {share:.1%} of the trials a run in {names.places[q]} was preempted later than "
+                "any ended by itself, so how long it would take now is a guess"
+            )
 
 
 class _SimulatedNet:

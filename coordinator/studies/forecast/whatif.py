@@ -9,6 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.time.measured import is_cause
 from petrobot.coordinator.analysis.time.whatif import Change, in_range, statuses_of
 from petrobot.coordinator.studies.forecast.history import (
     CENSORED,
@@ -19,15 +20,18 @@ from petrobot.coordinator.studies.forecast.history import (
     Training,
     Values,
 )
-from petrobot.coordinator.task import Status
+from petrobot.coordinator.task import Counts, Status
+
+FEWEST = 30
+"""The fewest active runs from which it is taken when an event comes."""
 
 
 def changed(training: Training, runs: Runs, changes: Sequence[Change]) -> Runs:
     """Return runs in which actions last longer or shorter, or end otherwise more often.
 
     A run that was cut off is scaled as a successful one is: it would have been active for so long
-    at least. What an event or a timer preempted, and what was ended at its deadline, keeps its
-    time and its share. Raises NetFileError.
+    at least. What ends a run at its deadline, or an event or timer that preempts it, keeps its
+    time: longer runs are ended by it more often. Raises NetFileError.
     """
     task, names = training.task, training.vocabulary
     scale: dict[tuple[int, int, int], float] = {}
@@ -141,9 +145,94 @@ def _scaled(training: Training, runs: Runs, scale: Mapping[tuple[int, int, int],
             before &= seen[q] < at_deadline(training, q, runs.of(own))[0]
         took[own] *= factor
         seen[q, before] *= factor
-    longer = (took > runs.took) & ~runs.censored
+    preempted, censored = runs.preempted.copy(), runs.censored.copy()
+    for q, action in {(q, action): None for q, action, _ in scale}:
+        cell = np.flatnonzero(_of(runs, q, action))
+        ends, times, by = _raced(runs.of(cell), took[cell])
+        took[cell], outcome[cell] = times, runs.outcome[cell][ends]
+        preempted[cell] = by
+        censored[cell] &= ~by
+        for limit, at_limit in _timers(training, q):
+            late = cell[took[cell] > np.maximum(runs.took[cell], limit)]
+            took[late], outcome[late], preempted[late] = limit, at_limit, True
+            censored[late] = False
+    longer = (took > runs.took) & ~censored & ~preempted
     for q in np.unique(runs.place[longer]).tolist():
         limit, at_limit = at_deadline(training, q, runs.of(runs.place == q))
         late = longer & (runs.place == q) & (took > limit)
         took[late], outcome[late] = limit, at_limit
-    return replace(runs, took=took, outcome=outcome, seen=replace(runs.seen, took=seen))
+    ended = replace(runs, took=took, outcome=outcome, preempted=preempted, censored=censored)
+    return replace(ended, seen=replace(runs.seen, took=seen))
+
+
+def _timers(training: Training, place: int) -> list[tuple[float, int]]:
+    """Return the timers that preempt the runs of a place: after how long (s), and the outcome."""
+    names, flat = training.vocabulary, training.task.flat
+    found = []
+    for t in flat.transitions.values():
+        (arc,) = [a for a in t.inputs if a.place == names.places[place]] or (None,)
+        if arc is not None and arc.counts is not None and t.after is not None and is_cause(flat, t):
+            none = arc.counts is Counts.NONE
+            status = CENSORED if none else STATUSES.index(Status(arc.counts.value))
+            found.append((t.after, names.outcome(status, names.transitions.index(t.name))))
+    return sorted(found)
+
+
+def _raced(runs: Runs, took: Values) -> tuple[Codes, Values, NDArray[np.bool_]]:
+    """Return how the runs of an action in a place end that take `took`, while the events and timers
+    that preempt them come as before: each as another of these runs (its index), when, and whether
+    preempted.
+
+    A run shows only which of the two came first. The other is drawn from those that came later
+    elsewhere, as if they were independent (Kaplan-Meier), always with the same random numbers.
+    """
+    n = len(runs)
+    by = runs.preempted & ~runs.censored
+    ends, times, preempted = np.arange(n), took.copy(), by.copy()
+    if not by.any() or by.all():
+        return ends, times, preempted
+    draws = np.random.default_rng(0).random((2, n))
+    event = _Later(runs, by, FEWEST)
+    own = _Later(runs, ~by & ~runs.censored)
+    for i in range(n):
+        if by[i]:
+            j, least = own.after(runs.took[i], draws[0, i])
+            new = least * took[j] / runs.took[j] if runs.took[j] else took[j]
+            earlier = new < runs.took[i]
+        else:
+            j, new = event.after(runs.took[i], draws[1, i])
+            earlier = new < took[i]
+        if earlier:
+            ends[i], times[i], preempted[i] = j, new, by[j]
+    return ends, times, preempted
+
+
+class _Later:
+    """When runs that are still active after some time end in one of several ways.
+
+    Beyond the last end so, or where fewer than `least` runs are active, the tail is exponential.
+    """
+
+    def __init__(self, runs: Runs, which: NDArray[np.bool_], least: int = 1) -> None:
+        order = np.lexsort((~which, runs.took))
+        weight, ended = runs.weight[order], which[order]
+        active = np.cumsum(weight[::-1])[::-1]
+        stays = np.where(ended & (active > 0.0), 1.0 - weight / np.maximum(active, 1e-300), 1.0)
+        known = ended & (np.arange(len(runs), 0, -1) >= least)
+        self.runs, self.times = order[known], runs.took[order][known]
+        self.left = np.cumprod(stays)[known]
+        self.donor = int(order[ended][-1]) if ended.any() else 0
+        lasted = float(runs.weight @ runs.took)
+        self.rate = float(weight @ ended) / lasted if lasted else 0.0
+
+    def after(self, time: float, draw: float) -> tuple[int, float]:
+        """Return the run that ends so, and when; infinity if none does."""
+        first = int(np.searchsorted(self.times, time, side="right"))
+        now = float(self.left[first - 1]) if first else 1.0
+        at = first + int(np.searchsorted(-self.left[first:], -draw * now, side="left"))
+        if at < len(self.times):
+            return int(self.runs[at]), float(self.times[at])
+        known = float(self.left[-1]) / now if len(self.left) and now else 1.0
+        since = max(time, float(self.times[-1])) if len(self.times) else time
+        wait = -np.log(draw / known) / self.rate if self.rate and 0.0 < draw < known else np.inf
+        return self.donor, since + wait

@@ -22,15 +22,20 @@ from petrobot.coordinator.task import (
     VariableType,
 )
 from petrobot.coordinator.task.check.findings import Finding
+from petrobot.coordinator.task.conditions import Compare, Literal, Name, walk
 from petrobot.coordinator.task.wording import Severity, few, listed, nearest
 
 Code = Mapping[str, Mapping[str, Any]]
 """By action: what `services.code_reading` found in it, and as `device` the same of its driver."""
 RUNTIME = (
     *("bad_arguments", "bad_result", "busy", "cancelled", "command_not_taken", "command_refused"),
-    *("deadline", "device_died", "emergency_stop", "exception", "fenced", "hung", "import_failed"),
-    *("node_lost", "node_silent", "not_ready", "out_of_memory", "stopped", "too_many_events"),
-    *("unknown_service", "worker_died"),
+    *("crashed", "deadline", "device_died", "device_fenced", "device_leased"),
+    *("device_needs_coordinator", "device_overtaken", "emergency_stop", "exception", "fenced"),
+    *("forgotten", "hung", "id_taken", "import_failed", "local_only", "lost", "no_answer"),
+    *("node_lost", "node_silent", "not_accepted", "not_for_role", "not_ready", "not_welcome"),
+    *("old_epoch", "orphan", "out_of_memory", "rebooted", "refused", "resumed", "stopped"),
+    *("too_large", "too_many_events", "unencodable", "unknown_service", "unreachable"),
+    *("worker_died",),
 )
 """Causes that the runtime gives to runs of any action."""
 _FITS: Mapping[str, tuple[type, ...]] = {
@@ -89,6 +94,7 @@ def code_findings(
                 yield from _kinds(task, place, action, code[action])
     for primitive in task.primitive_tasks.values():
         yield from _causes(primitive, code)
+        yield from _reasons(task, primitive, code)
         yield from _too_long(primitive, code)
         yield from _costs(primitive, code)
     if code.keys() >= args.keys():
@@ -335,6 +341,32 @@ def _causes(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
         text = f"its actions also return {listed(undeclared)}"
         remedy = "declare each with a sentence for people"
         yield Finding(Severity.WARNING, "code", key, text, remedy)
+
+
+def _reasons(task: Task, primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
+    """Conditions that compare the cause of a run with one that no action can give."""
+    facts = [code[a] for a in primitive.alternatives if "causes" in code.get(a, {})]
+    if len(facts) < len(primitive.alternatives):
+        return
+    said = {w for f in facts for w in (*f["words"], *f.get("device", {}).get("words", ()))}
+    said |= {*primitive.error_causes, *(cause for f in facts for cause in f["causes"])}
+    nets = [("", task.flat.places, task.transitions)]
+    nets += [(f"subnets.{s.name}.", s.places, s.transitions) for s in task.subnets.values()]
+    for prefix, places, t in ((net[0], net[1], t) for net in nets for t in net[2].values()):
+        reasons = {f"{p.name}.reason" for p in places.values() if p.task == primitive.name}
+        for node in walk(t.when.tree) if t.when is not None else ():
+            sides = {node.left, node.right} if isinstance(node, Compare) else set()
+            names = {one.name for one in sides if isinstance(one, Name)}
+            causes = {one.value for one in sides if isinstance(one, Literal)}
+            for cause in causes - said - {*RUNTIME} if names & reasons else ():
+                if not isinstance(cause, str) or not cause.isidentifier():
+                    continue
+                hint = nearest(cause, sorted({c for f in facts for c in f["causes"]}))
+                if hint or all(f["complete"] for f in facts):
+                    text = f"no action of {primitive.name} ends with the cause {cause!r}{hint}"
+                    remedy = "correct it, or let the action return it"
+                    key = f"{prefix}transitions.{t.name}.when"
+                    yield Finding(Severity.WARNING, "code", key, text, remedy)
 
 
 def _costs(primitive: PrimitiveTask, code: Code) -> Iterator[Finding]:
