@@ -379,7 +379,7 @@ IN_THE_CODE: list[Mistake] = [
         CODE,
         "def step(self, now: float)",
         "def step(self)",
-        r"`step` of Axis takes \(self\), but is called with \(self, now\); write",
+        r":7: devices.axis.driver: `step` of Axis \(arm_bot.py:\d+\) takes \(self\), but is called ",
     ),
     (
         CODE,
