@@ -836,6 +836,11 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         seen.complete, seen.any_put = False, True
     own = _code(thing) if inspect.isfunction(thing) else None
     if own is not None:
+        if inspect.isgeneratorfunction(thing) or inspect.isasyncgenfunction(thing):
+            made = next(n for n in own.nodes if isinstance(n, ast.Yield | ast.YieldFrom))
+            text = f"`yield` makes {thing.__name__} a generator, which does nothing"
+            text += "; report progress by `ctx.progress(...)`, and return one result"
+            seen.faults.append((own.file, made.lineno, text))
         _ends(own, thing.__name__, seen)
         _asks_device(own, _driver_of(hints.get(first.name) if first else None), seen)
     if alone:

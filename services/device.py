@@ -179,8 +179,8 @@ class Key:
         if self.name not in config:
             return f"is missing; give {self._expected()}" if default is _Required else ""
         value = config[self.name]
-        nan = isinstance(value, float) and value != value
-        fits = self._is_typed(value) and not nan
+        endless = isinstance(value, float) and not math.isfinite(value)
+        fits = self._is_typed(value) and not endless
         return "" if fits else f"expected {self._expected()}, found {value!r:.60}"
 
     def read(self, config: Mapping[str, Any]) -> Any:
