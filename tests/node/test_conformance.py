@@ -686,6 +686,34 @@ def test_what_cannot_be_judged_ends_the_check_with_one_fault(kind: type[Axis]) -
     assert len(checked(kind).faults) == 1
 
 
+class StandsInTheQueue(Axis):
+    """Its step takes long, because other programs have the processor."""
+
+    queued = 0.0
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        begin = time.perf_counter()
+        time.sleep(0.02)
+        StandsInTheQueue.queued += time.perf_counter() - begin
+
+
+def test_a_step_is_not_blamed_for_what_other_programs_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    def check() -> list[str]:
+        made = lambda: StandsInTheQueue({}, cast(Ports, None))  # noqa: E731
+        found = check_driver(made, seconds=0.5, within=0.05)
+        return [one for one in found.faults if "took longer than the period" in one]
+
+    monkeypatch.setattr(conformance, "LATE_SHARE", 0.5)  # what this computer itself takes
+    assert check()
+    monkeypatch.setattr(
+        conformance._Check,
+        "scheduled",
+        lambda _: (time.thread_time(), StandsInTheQueue.queued),
+    )
+    assert check() == []
+
+
 class Switched(Axis):
     """Its drives must be switched on; what was ordered last is kept by its device."""
 
