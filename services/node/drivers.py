@@ -67,8 +67,8 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
             "petrobot.Driver"
         )
         raise DirectoryError((f"{here}.driver: {text}",))
-    if faults := faults_of_methods(driver):  # also one that hides a method by a value of its own
-        raise DirectoryError((f"{here}.driver: {'; '.join(faults)}",))
+    if odd := faults_of_methods(driver):  # also one that hides a method by a value of its own
+        raise DirectoryError((f"{here}.driver: {'; '.join(odd)}",))
     if wrong := fault_of_period(driver):
         raise DirectoryError((f"{here}.driver: {device.driver}.{wrong}",))
     return driver
