@@ -19,6 +19,8 @@ QUALITY = 75
 
 LATEST = 10.0
 """Seconds after which `take` must have an image exposed since it began."""
+AHEAD = 1.0
+"""Seconds by which an image may be newer than now: above it, another clock was read."""
 
 
 class CameraError(ValueError):
@@ -143,6 +145,9 @@ class CameraDriver(Driver):
             return f"pixels of shape (height, {wanted}, found {shape}: correct it in {source}"
         if not isinstance(image.time, int | float) or not math.isfinite(image.time):
             return f"a time in seconds, found {image.time!r:.40}: correct it in {source}"
+        if image.time > self.ports.now + AHEAD:
+            text = f"a time of the clock that the class is given, at most {self.ports.now:.1f} s"
+            return f"{text}, found {image.time:.1f} s: correct it in {source}"
         return ""
 
     # For the node and the operator

@@ -37,12 +37,11 @@ from petrobot.services import action as actions
 from petrobot.services.comm.location_file import MEMORY_CALLS, resolve
 from petrobot.services.comm.location_file.code import SLOW
 from petrobot.services.device import (
+    INTERFACE,
     LIMITS,
     Driver,
-    HasPicture,
     Key,
     Ports,
-    QuickStopping,
     Remote,
     faults_of_keys,
     faults_of_limits,
@@ -80,13 +79,6 @@ METHODS = ("period", "state", "stop", "stopped", "hold", "release", "close")
 CYCLIC = ("command", "step")
 """Methods that a driver with a period needs in addition to `METHODS`."""
 CALLED_IN_CYCLE = ("step", "command", "state", "stop", "stopped", "hold", "release", "quick_stop")
-INTERFACE = {
-    name: method
-    for kind in (Driver, QuickStopping, HasPicture)
-    for name, method in vars(kind).items()
-    if inspect.isfunction(method) and not name.startswith("_")
-}
-"""Methods that a node calls, with their parameters."""
 ANSWERS = ("state", "stopped", "hold", "picture")
 """Methods whose answer a node needs."""
 _KINDS = {bool: "bool", int: "int", float: "float", str: "str", list: "list", dict: "dict"}
@@ -844,6 +836,11 @@ def _function(thing: Callable[..., Any]) -> dict[str, Any]:
         seen.complete, seen.any_put = False, True
     own = _code(thing) if inspect.isfunction(thing) else None
     if own is not None:
+        if inspect.isgeneratorfunction(thing) or inspect.isasyncgenfunction(thing):
+            made = next(n for n in own.nodes if isinstance(n, ast.Yield | ast.YieldFrom))
+            text = f"`yield` makes {thing.__name__} a generator, which does nothing"
+            text += "; report progress by `ctx.progress(...)`, and return one result"
+            seen.faults.append((own.file, made.lineno, text))
         _ends(own, thing.__name__, seen)
         _asks_device(own, _driver_of(hints.get(first.name) if first else None), seen)
     if alone:
@@ -1033,8 +1030,8 @@ def _own_names(thing: type) -> list[str] | None:
 
 
 def _methods(thing: type[Driver], seen: _Seen) -> None:
-    """Record methods of a driver that its node cannot call, that answer nothing, or that it never
-    calls because of their names."""
+    """Record methods of a driver that answer nothing, and those that its node never calls because
+    of their names."""
     for base in thing.__mro__[: thing.__mro__.index(Driver)]:
         for name, method in vars(base).items():
             used = inspect.isfunction(method) and getattr(thing, name) is method
@@ -1042,7 +1039,7 @@ def _methods(thing: type[Driver], seen: _Seen) -> None:
                 _unset_names(thing, code, seen)
                 line = code.tree.lineno  # type: ignore[attr-defined]
                 what = f"`{name}` of {base.__name__}"
-                if text := _fault_of_method(name, method, code):
+                if text := _fault_of_method(name, code):
                     seen.faults.append((code.file, line, f"{what} {text}"))
                 elif near := _meant(thing, name):
                     text = f"{what} is never called; did you mean `{near}`?"
@@ -1061,17 +1058,10 @@ def _unset_names(thing: type[Driver], code: _Code, seen: _Seen) -> None:
                 seen.doubtful.append((code.file, node.lineno, text))
 
 
-def _fault_of_method(name: str, method: Callable[..., Any], code: _Code) -> str:
+def _fault_of_method(name: str, code: _Code) -> str:
     """Return why a node cannot use a method of its driver's interface; empty if it can."""
     if name not in INTERFACE:
         return ""
-    takes = list(inspect.signature(INTERFACE[name]).parameters)
-    written = f"def {name}({', '.join(takes)})"
-    try:
-        inspect.signature(method).bind(*takes)
-    except TypeError:
-        own = ", ".join(inspect.signature(method).parameters)
-        return f"takes ({own}), but is called with ({', '.join(takes)}); write `{written}`"
     answers = any(
         isinstance(node, ast.Return | ast.Yield) and node.value is not None for node in code.nodes
     )

@@ -31,7 +31,14 @@ from msgspec.structs import replace
 
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.plain import plain
-from petrobot.services.device import LIMITS, Driver, QuickStopping, keys_of
+from petrobot.services.device import (
+    LIMITS,
+    Driver,
+    QuickStopping,
+    fault_of_period,
+    faults_of_methods,
+    keys_of,
+)
 from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.rehearsal import TestPorts
 from petrobot.services.worker.callables import RAISED, describe, from_outside
@@ -151,12 +158,12 @@ def check_driver(
         check.rules(commands, seconds, cable)
         if isinstance(clock, _Clock):
             check.seeds(clock, commands)
-    except _TooLongError as fault:
+    except _EndError as fault:
         check.fault(str(fault))
     except FAULTS as fault:
         *_, (where, _) = traceback.walk_tb(fault.__traceback__)
-        # no fault of the driver, but a Ctrl-C, or a bug here
-        if from_outside(fault) or where.f_code.co_filename == __file__:
+        ours = where.f_code.co_filename == __file__ and where.f_code is not _Check.ask.__code__
+        if from_outside(fault) or ours:  # no fault of the driver, but a Ctrl-C, or a bug here
             raise
         verb = "hangs:" if isinstance(fault, Hung) else "raised"
         check.fault(f"the driver {verb} {describe(fault)}")
@@ -175,6 +182,8 @@ def _with_ports(make: Callable[..., Driver], clock: Callable[[], float]) -> Call
     @wraps(make)
     def made(**keys: Any) -> Driver:
         driver = make(**keys)
+        if faults := faults_of_methods(driver):
+            raise ValueError("; ".join(faults))
         TestPorts.of(driver).begin(clock, [], defaultdict(lambda: 1.0))
         return driver
 
@@ -233,14 +242,15 @@ class _Clock:
         self.passed += seconds
 
 
-class _TooLongError(Exception):
-    """A movement is not at its end after `seconds`: nothing after it could be judged."""
+class _EndError(Exception):
+    """A fault after which nothing could be judged, such as a movement without an end."""
 
 
-def _too_long(command: Command, seconds: float) -> _TooLongError:
-    return _TooLongError(
+def _too_long(command: Command, seconds: float) -> _EndError:
+    return _EndError(
         f"{dict(command)}: took longer than `seconds` = {seconds:g} s, so nothing more was "
-        "checked; give a shorter command, or larger `seconds`"
+        "checked; give a shorter command, or larger `seconds` (a command that moves it until it is "
+        "stopped cannot be checked)"
     )
 
 
@@ -285,7 +295,7 @@ class _Check:
         self.watch = Watchdog("test")
         with self.watch:
             self.driver = make()
-        self.period = max(0.0, self.driver.period or 0.0) or 0.01
+        self.period = (not fault_of_period(self.driver) and self.driver.period) or 0.01
         self.idle: dict[str, float] = {}
         """By how much each number of the state usually changes in a step at rest."""
         self.fresh = True
@@ -312,15 +322,14 @@ class _Check:
         self.found.notes.append(f"not checked: {text}")
 
     def numbers(self) -> dict[str, float]:
-        """Return the numbers of the state that may tell where the device is, by path."""
+        """Return the numbers of the state that may tell where the device is, by path. Raises
+        _EndError for a state that is not a table of plain data."""
         try:
             state = plain(self.ask(self.driver.state), "state")
         except RAISED as fault:
-            self.fault(f"state: expected plain data, got {describe(fault)}")
-            return {}
+            raise _EndError(f"state: expected plain data, got {describe(fault)}") from fault
         if not isinstance(state, dict):
-            self.fault(f"state: expected a table, got {state!r:.60}")
-            return {}
+            raise _EndError(f"state: expected a table, got {state!r:.60}")
         self.leaves = found = _leaves(state, LONGEST_ROW)
         for name, value in found.items():
             if isinstance(value, float) and math.isnan(value):
@@ -374,13 +383,14 @@ class _Check:
 
     def step(self) -> dict[str, float]:
         """Make one step and measure its time; return the numbers of the state after it."""
-        begin = self.now()
+        begin, queued = self.now(), self.scheduled()[1]
         if self.driver.period is not None:
             self.ask(self.driver.step, begin)
         numbers = self.numbers()
         took = self.now() - begin
-        self.steps, self.late = self.steps + 1, self.late + (took > self.period)
-        self.longest = max(self.longest, took)
+        own = took - (self.scheduled()[1] - queued)  # the rest other programs took
+        self.steps, self.late = self.steps + 1, self.late + (own > self.period)
+        self.longest = max(self.longest, own)
         self.ask(self.sleep, max(0.0, self.period - took))
         return numbers
 
@@ -446,8 +456,8 @@ class _Check:
 
     def life(self) -> None:
         """Make the driver, close it, make it again; stop it twice at rest."""
-        if self.driver.period is not None and not self.driver.period > 0.0:
-            self.fault(f"period: expected seconds above 0 or None, got {self.driver.period!r}")
+        if wrong := fault_of_period(self.driver):
+            raise _EndError(wrong)
         self.rest()
         self.again("close and a second driver of the same configuration")
         self.stop("stop at rest")
@@ -551,7 +561,7 @@ class _Check:
         self, there: Command, back: Command, positions: Mapping[str, float], seconds: float
     ) -> None:
         """Judge whether the device stands at the end of a `way`, and where. Raises
-        _TooLongError."""
+        _EndError."""
         moving = self.run(self.within, self.stopped, positions)
         if self.stopped() or not moving:
             self.clamped((there, self.numbers()), (back, self.start), positions)
@@ -869,7 +879,10 @@ class _Check:
         return drifted
 
     def stopped(self) -> bool:
-        return bool(self.ask(self.driver.stopped))
+        answer = self.ask(self.driver.stopped)
+        if answer not in (True, False):
+            raise _EndError(f"stopped: expected True or False, got {answer!r:.60}")
+        return bool(answer)
 
     def cable(
         self, cable: Callable[[bool], None], commands: Sequence[Command], seconds: float

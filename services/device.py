@@ -11,10 +11,21 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
-from inspect import iscoroutinefunction
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from functools import cached_property
+from inspect import getattr_static, iscoroutinefunction, isfunction, signature
+from types import NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Protocol,
+    Union,
+    get_args,
+    get_origin,
+    runtime_checkable,
+)
 
 from petrobot.services.comm.canopen.bus import CanBus
 from petrobot.services.comm.location_file.reading import nearest
@@ -138,10 +149,17 @@ class Key:
         said = owner.__annotations__.get(name)
         known = {k.__name__: k for k in (bool, int, float, str, list, dict)}
         if said is not None:
-            word = said if isinstance(said, str) else said.__name__
-            self.kind = known.get(word.partition("[")[0].strip(), object)
+            self.kind = known.get(_type_word(said), object)
         elif self.default is not _Required:
             self.kind = type(self.default)
+
+    def __get__(self, driver: object, owner: type) -> Any:
+        """Return the key itself of a class. Raises AttributeError in a driver that has not read its
+        keys: a read value hides this."""
+        if driver is None:
+            return self
+        text = f"{self.name}: the key is not read yet; a constructor of your own first calls"
+        raise AttributeError(f"{text} super().__init__(config, ports)")
 
     def with_default(self, default: Any) -> Key:
         """Return the same key with another default."""
@@ -161,8 +179,8 @@ class Key:
         if self.name not in config:
             return f"is missing; give {self._expected()}" if default is _Required else ""
         value = config[self.name]
-        nan = isinstance(value, float) and value != value
-        fits = self._is_typed(value) and not nan
+        endless = isinstance(value, float) and not math.isfinite(value)
+        fits = self._is_typed(value) and not endless
         return "" if fits else f"expected {self._expected()}, found {value!r:.60}"
 
     def read(self, config: Mapping[str, Any]) -> Any:
@@ -185,6 +203,17 @@ class Key:
             dict: "a table",
         }
         return words.get(self.kind, "a value") + (f" ({self.text})" if self.text else "")
+
+
+def _type_word(said: Any) -> str:
+    """Return the name of the type in an annotation, which may be a text, without "or None"; empty
+    if it names several types."""
+    if not isinstance(said, str):
+        parts = get_args(said) if get_origin(said) in (Union, UnionType) else (said,)
+        said = "|".join(getattr(part, "__name__", "") for part in parts)
+    words = {word.strip() for word in re.sub(r"\[.*?\]", "", said).split("|")}
+    words -= {"None", NoneType.__name__}
+    return words.pop() if len(words) == 1 else ""
 
 
 def key(default: Any = _Required, text: str = "") -> Any:
@@ -379,10 +408,7 @@ def faults_of_limits(
         text = f"{driver.__name__}.obeys: expected a tuple, found {obeys!r:.60}; write"
         faults.append(("driver", f'{text} obeys = ("{obeys.strip():.60}",)'))
         obeys = (obeys,)
-    called = (*RESERVED, "quick_stop", PICTURE)
-    for name in sorted(n for n in called if iscoroutinefunction(getattr(driver, n, None))):
-        text = f"`{name}` of {driver.__name__} is `async`: its node does not await it, so it would"
-        faults.append(("driver", f"{text} do nothing; write `def {name}`"))
+    faults += [("driver", text) for text in faults_of_methods(driver)]
     for name in sorted({*obeys} - OBEYED):
         text = f"{driver.__name__}.obeys: expected some of {', '.join(sorted(OBEYED))}"
         faults.append(("driver", f"{text}; found {name!r:.60}"))
@@ -413,6 +439,48 @@ def faults_of_limits(
             except ValueError as fault:
                 faults.append((name, str(fault)))
     return faults
+
+
+def faults_of_methods(driver: object) -> list[str]:
+    """Return what is wrong with the methods of a driver, or of its class: those that its node
+    cannot call."""
+    kind = driver if isinstance(driver, type) else type(driver)
+    faults, absent = list[str](), object()
+    for name, usual in sorted(INTERFACE.items()):
+        if (method := getattr_static(driver, name, absent)) is absent:
+            continue
+        takes = ", ".join(given := list(signature(usual).parameters))
+        here, write = f"`{name}` of {kind.__name__}", f"write `def {name}({takes})`"
+        if isinstance(method, property | cached_property):
+            faults.append(f"{here} is a property, expected a method; remove the decorator")
+        elif not callable(method) and not hasattr(method, "__get__"):
+            text = f"{here} is {method!r:.40}, expected a method"
+            faults.append(f"{text}; {write}, and give this value another name")
+        elif iscoroutinefunction(method):
+            text = f"{here} is `async`: its node does not await it, so it would do nothing"
+            faults.append(f"{text}; write `def {name}`")
+        elif isfunction(method) and not _fits(method, given):
+            own = ", ".join(signature(method, follow_wrapped=False).parameters)
+            code = method.__code__
+            here += f" ({code.co_filename.rpartition('/')[2]}:{code.co_firstlineno})"
+            faults.append(f"{here} takes ({own}), but is called with ({takes}); {write}")
+    return faults
+
+
+def _fits(method: Callable[..., Any], given: Sequence[str]) -> bool:
+    try:
+        signature(method, follow_wrapped=False).bind(*given)  # a decorator may drop some of them
+    except TypeError:
+        return False
+    return True
+
+
+def fault_of_period(driver: Driver) -> str:
+    """Return what is wrong with a driver's period; empty if nothing is."""
+    period = driver.period
+    if period is None or (_is_number(period) and period > 0.0):
+        return ""
+    return f"period: expected seconds above 0 or None, found {period!r:.40}"
 
 
 def can_move(driver: type) -> bool:
@@ -506,6 +574,15 @@ class HasPicture(Protocol):
         """Return the newest picture: `mime`, `data` (bytes), `width`, `height` (px), `age` (s),
         `note` and `detections` as in docs/operator-protocol.md; empty when there is none. Called a
         few times per second, only while an operator watches."""
+
+
+INTERFACE = {
+    name: method
+    for kind in (Driver, QuickStopping, HasPicture)
+    for name, method in vars(kind).items()
+    if isfunction(method) and not name.startswith("_") and name != "limit"
+}
+"""Methods that a node calls, with their parameters."""
 
 
 def picture_of(driver: Driver | None) -> Mapping[str, Any]:

@@ -5,10 +5,16 @@ from __future__ import annotations
 
 import inspect
 import logging
-import math
 
 from petrobot.services.comm.location_file import DeviceEntry, Directory, DirectoryError, resolve
-from petrobot.services.device import Driver, Ports, can_move, faults_of_limits
+from petrobot.services.device import (
+    Driver,
+    Ports,
+    can_move,
+    fault_of_period,
+    faults_of_limits,
+    faults_of_methods,
+)
 from petrobot.services.worker.callables import RAISED, describe, log_fault
 
 _log = logging.getLogger(__name__)
@@ -61,8 +67,8 @@ def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driv
             "petrobot.Driver"
         )
         raise DirectoryError((f"{here}.driver: {text}",))
-    period = driver.period
-    if period is not None and not (isinstance(period, int | float) and 0.0 < period < math.inf):
-        text = f"{device.driver}.period: expected seconds above 0 or None, found {period!r:.40}"
-        raise DirectoryError((f"{here}.driver: {text}",))
+    if odd := faults_of_methods(driver):  # also one that hides a method by a value of its own
+        raise DirectoryError((f"{here}.driver: {'; '.join(odd)}",))
+    if wrong := fault_of_period(driver):
+        raise DirectoryError((f"{here}.driver: {device.driver}.{wrong}",))
     return driver

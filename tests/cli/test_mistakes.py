@@ -315,6 +315,14 @@ IN_THE_CELL: list[Mistake] = [
         "max_speed = 0.5",
         r":LINE: devices.axis.max_speed: unknown key; did you mean 'top_speed'",
     ),
+    (CELL, "top_speed = 0.5", "speed = nan", r":LINE: .*the normal speed, found nan"),
+    (CELL, "top_speed = 0.5", "top_speed = inf", r":LINE: .*a number \(m/s\), found inf"),
+    (
+        CELL,
+        "top_speed = 0.5",
+        "top_speed = 2024-01-01",
+        r":LINE: devices.axis.top_speed: a date is not plain data; write it in quotes",
+    ),
     (CELL, "top_speed = 0.5", "limit = 1", r"axis.limit: unknown key; known: top_speed, length"),
     (
         CELL,
@@ -385,7 +393,15 @@ IN_THE_CODE: list[Mistake] = [
         CODE,
         "def step(self, now: float)",
         "def step(self)",
-        r"`step` of Axis takes \(self\), but is called with \(self, now\); write",
+        r":7: devices.axis.driver: `step` of Axis \(arm_bot.py:\d+\) takes \(self\), but is ca",
+    ),
+    (
+        CODE,
+        "async def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n",
+        "def grip(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n"
+        "    yield 0.3\n    return success()\n\n\n"
+        "async def other(ctx: Context[Remote], *, slips: float = 0.2) -> Result:\n",
+        r"arm_bot.py:\d+: `yield` makes grip a generator, which does nothing; report progress by",
     ),
     (
         CODE,

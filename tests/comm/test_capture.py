@@ -504,10 +504,20 @@ def test_sources_by_config(config: dict[str, object], kind: type) -> None:
     assert isinstance(open_images(config, time.monotonic), kind)
 
 
+class Foreign(Own):
+    """It lacks what a source needs."""
+
+    newest = None  # type: ignore[assignment]
+
+    def condition(self) -> str:  # type: ignore[override]
+        return ""
+
+
 @pytest.mark.parametrize(
     ("config", "text"),
     [
         ({}, "source = ''"),
+        ({"source": "tests.comm.test_capture:Foreign"}, r"has no newest, condition \(a text"),
         ({"source": "sim"}, "needs address"),
         ({"source": "sim", "address": "host"}, "needs address"),
         ({"source": "capture:front"}, 'use "sim", "capture:0"'),

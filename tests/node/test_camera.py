@@ -96,6 +96,7 @@ def test_an_image_exposed_before_is_not_taken() -> None:
         ({"kind": None}, "expected pixels of type uint8, found NoneType"),
         ({"times": repeat(None)}, "expected a time in seconds, found None: correct it in sim"),
         ({"times": repeat(float("nan"))}, "expected a time in seconds, found nan"),
+        ({"times": repeat(1.7e9)}, "expected a time of the clock that the class is given, at most"),
         ({"condition": "camera 'x' was lost"}, "was lost"),
     ],
 )

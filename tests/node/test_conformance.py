@@ -474,6 +474,21 @@ class HasAListAsState(Axis):
         return [self.at]
 
 
+class ForgetsItsAnswer(Axis):
+    def stopped(self) -> Any:
+        super().stopped()
+
+
+class HidesAMethodLater(Axis):
+    def step(self, now: float) -> None:
+        super().step(now)
+        self.stopped: Any = self.goal is None
+
+
+class WritesItsPeriod(Axis):
+    period: Any = "0.01"
+
+
 class CannotBeClosed(Axis):
     def close(self) -> None:
         raise OSError("the port is gone")
@@ -611,6 +626,9 @@ class DrawsByItself(Axis):
         (LeavesAThread, "close: leaves a thread behind: reader"),
         (LeavesAThreadForEachCommand, "close: leaves a thread behind: sender"),
         (HasAListAsState, "state: expected a table, got [0.0]"),
+        (ForgetsItsAnswer, "stopped: expected True or False, got None"),
+        (HidesAMethodLater, "TypeError: 'bool' object is not callable"),
+        (WritesItsPeriod, "period: expected seconds above 0 or None, found '0.01'"),
         (CannotBeClosed, "close: OSError: the port is gone in close (test_conformance.py:"),
         (LeavesInItsStep, "SystemExit: the library has had enough in step (test_conformance.py:"),
         (InterruptsItsStep, "the driver raised KeyboardInterrupt:  in step (test_conformance.py:"),
@@ -630,7 +648,7 @@ class DrawsByItself(Axis):
         (DrawsByItself, "two runs with the same seed differ in axis[0].at"),
         (IgnoresQuickStop, "quick_stop during a movement: stopped() is still False after 1 s"),
         (QuickStopsOnce, "quick_stop, a second time: RuntimeError: already stopped"),
-        (Backwards, "period: expected seconds above 0 or None, got -0.01"),
+        (Backwards, "period: expected seconds above 0 or None, found -0.01"),
         (NeverStops, "stop during a movement: stopped() is still False after 1 s"),
         (
             SaysItStands,
@@ -661,6 +679,39 @@ def test_each_broken_rule_is_named(
     found = [*check.faults, *(check.busy if waiting else ())]
     assert any(fault in one for one in found), found
     assert kind is not BreaksOnTheWay or BreaksOnTheWay.after[-2:] == ["stop", "close"]
+
+
+@pytest.mark.parametrize("kind", [HasAListAsState, StrangeState, ForgetsItsAnswer, WritesItsPeriod])
+def test_what_cannot_be_judged_ends_the_check_with_one_fault(kind: type[Axis]) -> None:
+    assert len(checked(kind).faults) == 1
+
+
+class StandsInTheQueue(Axis):
+    """Its step takes long, because other programs have the processor."""
+
+    queued = 0.0
+
+    def step(self, now: float) -> None:
+        super().step(now)
+        begin = time.perf_counter()
+        time.sleep(0.02)
+        StandsInTheQueue.queued += time.perf_counter() - begin
+
+
+def test_a_step_is_not_blamed_for_what_other_programs_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    def check() -> list[str]:
+        made = lambda: StandsInTheQueue({}, cast(Ports, None))  # noqa: E731
+        found = check_driver(made, seconds=0.5, within=0.05)
+        return [one for one in found.faults if "took longer than the period" in one]
+
+    monkeypatch.setattr(conformance, "LATE_SHARE", 0.5)  # what this computer itself takes
+    assert check()
+    monkeypatch.setattr(
+        conformance._Check,
+        "scheduled",
+        lambda _: (time.thread_time(), StandsInTheQueue.queued),
+    )
+    assert check() == []
 
 
 class Switched(Axis):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 import pytest
 
 from petrobot.services.comm.location_file import DeviceEntry, DirectoryError, parse
-from petrobot.services.device import Driver, key, read_keys, table
+from petrobot.services.device import Driver, faults_of_methods, key, read_keys, table
 from petrobot.services.node.drivers import make_driver
 
 CELL = """schema = 1
@@ -31,6 +32,13 @@ class Scanner(Driver):
     def read(self) -> str:
         """Return the newest code."""
         return f"{self.port}@{self.rate}"
+
+
+class Hides(Driver):
+    """A driver with a value that has the name of a method."""
+
+    def setup(self) -> None:
+        self.state: Any = "idle"
 
 
 class Broken(Driver):
@@ -108,6 +116,94 @@ def test_a_default_has_the_type_of_its_key() -> None:
     for config in ({}, {"tries": 3}):
         with pytest.raises(ValueError, match=r"tries: .* found the default 'three' of its `key`"):
             read_keys(Wrong, config)
+
+
+def test_an_optional_key_has_the_type_of_its_values() -> None:
+    class Optionally(Driver):
+        port: str | None = key(None)
+        rate: list[int] | None = key(None)
+        either: list[int] | str = key(None)
+
+    for name, word in (("port", "a text"), ("rate", "a list")):
+        with pytest.raises(ValueError, match=f"{name}: expected {word}, found 7"):
+            read_keys(Optionally, {name: 7})
+    assert read_keys(Optionally, {"either": "x"})["port"] is None
+    for said in (int | None, Optional[int], "int | None", int):  # noqa: UP045
+        late = key(None)
+        holder = type("Holder", (Driver,), {"__annotations__": {"late": said}})
+        late.__set_name__(holder, "late")
+        assert late.kind is int
+
+
+def test_a_key_that_was_not_read_says_why() -> None:
+    class Forgets(Driver):
+        opening: float = key(0.08)
+
+        def __init__(self, config: Mapping[str, Any], ports: Any) -> None:
+            self.width = self.opening
+
+    with pytest.raises(AttributeError, match=r"opening: .* first calls super\(\).__init__\(config"):
+        Forgets({}, None)
+
+
+def without_time(method: Any) -> Any:
+    @wraps(method)
+    def called(self: Any, *_: Any) -> Any:
+        return method(self)
+
+    return called
+
+
+class Odd(Driver):
+    """Its methods are as in `Driver`, in other words."""
+
+    @without_time
+    def stop(self) -> None:
+        self.halted = True
+
+    @staticmethod
+    def step(now: float) -> None:
+        """Do nothing."""
+
+    def stopped(self) -> bool:
+        return True
+
+    def hold(self, *anything: Any) -> str:
+        return "held"
+
+
+def test_methods_that_a_node_cannot_call_are_named() -> None:
+    def faults(**changed: Any) -> list[str]:
+        return faults_of_methods(type("Claw", (Driver,), changed))
+
+    assert (
+        faults_of_methods(Driver)
+        == faults_of_methods(Odd)
+        == faults_of_methods(Odd({}, None))
+        == []
+    )
+    assert faults(stopped=property(lambda self: True)) == [
+        "`stopped` of Claw is a property, expected a method; remove the decorator"
+    ]
+    assert faults(state="idle") == [
+        "`state` of Claw is 'idle', expected a method; write `def state(self)`, and give this "
+        "value another name"
+    ]
+    (wrong,) = faults(stop=lambda self: None)
+    assert "`stop` of Claw (test_device.py:" in wrong
+    assert wrong.endswith(
+        " takes (self), but is called with (self, now); write `def stop(self, now)`"
+    )
+    made_later = Odd({}, None)
+    made_later.state = {}  # type: ignore[method-assign,assignment]
+    assert "`state` of Odd is {}, expected a method" in faults_of_methods(made_later)[0]
+
+
+def test_a_value_that_hides_a_method_is_refused_when_the_driver_is_made() -> None:
+    with pytest.raises(
+        DirectoryError, match=r"devices\.it\.driver: `state` of Hides is 'idle', exp"
+    ):
+        made("Hides")
 
 
 def test_a_value_in_a_derived_class_is_the_new_default_of_a_key() -> None:

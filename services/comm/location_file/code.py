@@ -22,7 +22,6 @@ from typing import Any
 from petrobot.services.comm.location_file import MEMORY, Directory
 from petrobot.services.comm.location_file.reading import CELLS, Faults, nearest
 from petrobot.services.comm.protocol.security import is_loopback
-from petrobot.services.host.json_text import json_text
 
 PROGRAM = "petrobot.services.code_reading"
 SECONDS = 20.0
@@ -79,7 +78,8 @@ def _ask(paths: list[Any], seconds: float) -> tuple[list[Facts], str]:
     last one. Code that comes with petrobot does not change while this process runs, so it is read
     once."""
     folders = [folder for folder in sys.path if folder not in CELLS[1:]]  # of other cells
-    question = json_text({"parent": os.getpid(), "sys_path": folders, "paths": paths})
+    asked = {"parent": os.getpid(), "sys_path": folders, "paths": paths}
+    question = json.dumps(asked, default=str)  # with nan, which a check must name as a node does
     if all(path.startswith("petrobot.") for path, _ in paths):
         return _ask_once(question, seconds)
     return _ask_process(question, seconds)

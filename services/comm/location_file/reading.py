@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from petrobot.services.comm.protocol.messages import COORDINATOR
+from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.host.toml_text import TomlError, key_lines, line_of, read_toml, shortened
 
 SCHEMA = 1
@@ -307,11 +308,17 @@ def _entries(
 def _check_key(
     here: str, key: str, value: Any, shape: Mapping[str, KeySpec], open_: bool, faults: Faults
 ) -> None:
-    if key in shape:
-        if not shape[key].fits(value):
-            faults.add(here, f"is {value!r}; write {shape[key].wants}")
-    elif not open_:
+    if key in shape and not shape[key].fits(value):
+        faults.add(here, f"is {value!r}; write {shape[key].wants}")
+        return
+    if key not in shape and not open_:
         faults.add(here, f"unknown key{nearest(key, shape)}")
+        return
+    try:  # TOML has dates and long integers, which no message carries
+        plain(value, here)
+    except NotPlainError as fault:
+        name, _, text = str(fault).partition(": ")
+        faults.add(name, text if ";" in text else f"{text}; write it in quotes")
 
 
 def _check_places(tables: Tables, faults: Faults, memory: str) -> None:

@@ -378,12 +378,22 @@ def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
     if kind == "file" and target:
         return RecordedImages(target, clock, colour=settings_of(config).colour)
     if kind not in ("capture", "file") and target.isidentifier():
-        return _own_source(kind, target)(config, clock)
+        own = _own_source(kind, target)(config, clock)
+        lacks = [name for name in METHODS if not callable(getattr(own, name, None))]
+        if not isinstance(getattr(own, "condition", None), str):
+            lacks.append("condition (a text, empty if nothing is wrong)")
+        if lacks:
+            raise ValueError(f"source = {source!r}: its class has no {', '.join(lacks)}")
+        return own
     shown = without_login(source)
     raise ValueError(
         f'source = {shown!r}: use "sim", "capture:0", "capture:/dev/v4l/by-id/...", a URL as in '
         '"capture:rtsp://...", "file:PATH", or "MODULE:CLASS" for a class of your own'
     )
+
+
+METHODS = ("start", "stop", "newest", "close")
+"""Methods of an image source."""
 
 
 def _own_source(module: str, name: str) -> Callable[[Mapping[str, Any], Clock], ImageSource]:
