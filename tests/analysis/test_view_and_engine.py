@@ -50,7 +50,7 @@ from petrobot.coordinator.engine import (
     TimerFired,
 )
 from petrobot.coordinator.engine.stimuli import Stimulus
-from petrobot.coordinator.task import Estimate, Executed, Scope, Status, Task
+from petrobot.coordinator.task import End, Estimate, Executed, Scope, Status, Task
 from petrobot.coordinator.task.conditions import parse
 from petrobot.coordinator.task.file import loads
 from tests.analysis.test_execution_graph import COMMON
@@ -240,7 +240,14 @@ def figures_agree(task: Task, measured: Measured | None = None) -> None:
     except TooLarge:
         assume(False)
     except ValueError as fault:  # what the view refuses
-        assert "one server" in str(fault) or "the search stopped" in str(fault)
+        said = str(fault)
+        # What takes nothing fires again at once. In the engine a preemption gets its turn, too.
+        takes_nothing = any(
+            all(arc.end is End.GOING for arc in t.inputs) and not t.events and t.after is None
+            for t in task.transitions.values()
+        )
+        trapped = takes_nothing and "fire for ever without delay" in said
+        assert "one server" in said or "the search stopped" in said or trapped
         assume(False)
     event(f"doubtful: {bool(view.doubts)}")
     assume(not view.doubts)
