@@ -12,6 +12,7 @@ from scipy.stats import erlang
 
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time import linear
 from petrobot.coordinator.analysis.time.completion import (
     completion,
     completion_time,
@@ -94,6 +95,26 @@ def test_kanban_throughput_as_published(n: int, throughput: float) -> None:
     assert run.throughput["tin1"] == pytest.approx(throughput, abs=1e-10 if n > 1 else 1e-15)
     assert run.throughput["tout4"] == pytest.approx(run.throughput["tin1"], abs=1e-13)
     assert run.residual < 1e-12
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_sweeps_find_what_elimination_finds(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Large systems are swept, with numba by a loop of their own (here as plain Python)."""
+    chain = Chain.of(Gspn.of(kanban(1), KANBAN_RATES))
+    exact = long_run(chain).probability
+    monkeypatch.setattr(linear, "DENSE", 1)
+    monkeypatch.setattr(linear, "COMPILED_FROM", 0 if compiled else 10**9)
+    monkeypatch.setattr(linear, "_compiled", lambda: linear.sweep_in_place)
+    assert long_run(chain).probability == pytest.approx(exact, abs=1e-12)
+    random = np.random.default_rng(1)
+    A = np.where(random.random((40, 40)) < 0.2, random.random((40, 40)), 0.0)
+    A *= 0.9 / A.sum(axis=1, keepdims=True)
+    rows, columns = np.nonzero(A)
+    right = random.random(40)
+    swept = linear._sweep(40, rows, columns, A[rows, columns], right)
+    assert swept == pytest.approx(np.linalg.solve(np.eye(40) - A, right), rel=1e-10)
 
 
 @pytest.mark.proof

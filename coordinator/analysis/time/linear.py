@@ -14,6 +14,8 @@ ones come from Gauss-Seidel.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from math import inf
 from typing import Any
 
@@ -28,10 +30,16 @@ DENSE = 600
 """Vertices up to which a component is solved by dense elimination."""
 DIRECT = 10_000
 """Vertices up to which a component on which coarse steps fail is solved by sparse elimination."""
+COMPILED_FROM = 200_000
+"""Vertices from which sweeps are compiled where numba is installed: loading it takes .4 s."""
 SWEEPS = 20_000
 """The most sweeps of Gauss-Seidel."""
 TOLERANCE = 1e-14
 """Largest change in a sweep, relative to the largest entry, at which the iteration stops."""
+
+
+Sweep = Callable[[Values, Values], Values]
+"""From (right, x) to the next x."""
 
 
 class NotConverged(ArithmeticError):  # noqa: N818 - a fact about an iteration
@@ -107,7 +115,7 @@ def _split(
 
 @np.errstate(over="raise", invalid="raise", divide="raise")
 def solve(plan: SolveOrder, value: Values, b: Values) -> Values:
-    """Solve x = b + A x, with A given by `value` on the edges; b and x of shape (n,) or (n, k).
+    """Solve x = b + A x, with A given by `value` on the edges.
 
     Raises ArithmeticError if the iteration does not converge, or a number overflows.
     """
@@ -126,11 +134,8 @@ def _gather(graph: Graph, value: Values, x: Values, vertices: Index) -> Values:
     """Return the sum of value * x over the edges of each vertex."""
     first, last = graph.row[vertices], graph.row[vertices + 1]
     edges = ranges(first, last)
-    terms = (value[edges] * x[graph.target[edges]].T).T
     owner = np.repeat(np.arange(len(vertices)), last - first)
-    if x.ndim == 1:
-        return sum_by(owner, terms, len(vertices))
-    return np.stack([sum_by(owner, c, len(vertices)) for c in terms.T], axis=1)
+    return sum_by(owner, value[edges] * x[graph.target[edges]], len(vertices))
 
 
 def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index) -> None:
@@ -150,22 +155,46 @@ def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index
         x[group] = _sweep(len(group), rows, columns, value[edges], right)
 
 
-def triangular(n: int, rows: Index, columns: Index, value: Values) -> tuple[Any, Any]:
-    """Return (solver of I - upper part, lower part): the two halves of a Gauss-Seidel sweep.
-
-    The upper part is triangular already. scipy's LU without reordering and pivoting turns it into
-    a compiled triangular solver.
-    """
+def sweeps(n: int, rows: Index, columns: Index, value: Values) -> Sweep:
+    """Return a sweep of backward Gauss-Seidel for x = right + A x."""
     from scipy.sparse import csc_array, csr_array, eye_array
     from scipy.sparse.linalg import splu
 
+    if n >= COMPILED_FROM and (compiled := _compiled()) is not None:
+        matrix = csr_array((value, (rows, columns)), shape=(n, n))
+        held = matrix.indptr, matrix.indices, matrix.data
+        return lambda right, x: compiled(*held, right, x.copy())
+    # The upper part is triangular already. scipy's LU without reordering and pivoting turns it into
+    # a compiled triangular solver.
     early = columns >= rows
     upper = csc_array((value[early], (rows[early], columns[early])), shape=(n, n))
     lower = csr_array((value[~early], (rows[~early], columns[~early])), shape=(n, n))
     factor = splu(
         csc_array(eye_array(n, format="csc") - upper), permc_spec="NATURAL", diag_pivot_thresh=0.0
     )
-    return factor, lower
+    return lambda right, x: np.asarray(factor.solve(right + lower @ x))
+
+
+@cache
+def _compiled() -> Callable[..., Values] | None:
+    """Return `sweep_in_place`, compiled; None without numba."""
+    from petrobot.services.host import numba_kernels
+
+    return numba_kernels.kernel(sweep_in_place) if numba_kernels.COMPILED else None
+
+
+def sweep_in_place(first: Index, column: Index, value: Values, right: Values, x: Values) -> Values:
+    """Replace x by the next one and return it. The entries of row i of A, one per column, are those
+    with first[i] <= k < first[i + 1]."""
+    for i in range(len(x) - 1, -1, -1):
+        total, own = right[i], 0.0
+        for k in range(first[i], first[i + 1]):
+            if column[k] == i:
+                own = value[k]
+            else:
+                total += value[k] * x[column[k]]
+        x[i] = total / (1.0 - own)
+    return x
 
 
 def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) -> Values:
@@ -178,17 +207,17 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
     from scipy.sparse import csc_array, eye_array
     from scipy.sparse.linalg import splu
 
-    factor, lower = triangular(n, rows, columns, value)
-    coarse, x = Coarse(n, rows, columns), factor.solve(right)
+    sweep, coarse = sweeps(n, rows, columns, value), Coarse(n, rows, columns)
+    x = sweep(right, np.zeros(n))
     inverse: Values | None = None
     helps, last = True, inf
     for k in range(SWEEPS):
         keep_time("linear system")
         before = x
-        x = factor.solve(right + lower @ x)
+        x = sweep(right, x)
         moved = float(np.max(np.abs(x - before)))
         if moved <= TOLERANCE * max(1e-300, float(np.max(np.abs(x)))):
-            return np.asarray(x)
+            return x
         if not coarse.is_due(k):
             continue
         # The error may differ too much within the blocks: then coarse steps enlarge it, without a
@@ -224,18 +253,18 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
         return gth(matrix)
     # nu = nu P is a system with the transposed matrix. Reversing the numbers as well makes the
     # backward sweep run forward along the edges.
-    factor, lower = triangular(n, n - 1 - columns, n - 1 - rows, value)
+    sweep, zero = sweeps(n, n - 1 - columns, n - 1 - rows, value), np.zeros(n)
     coarse, x = Coarse(n, n - 1 - rows, n - 1 - columns), np.full(n, 1.0 / n)
     mixing = Mixing()
     helps, last, moved = True, inf, inf
     for k in range(SWEEPS):
         keep_time("stationary distribution")
-        swept = factor.solve(lower @ x)
+        swept = sweep(zero, x)
         swept /= swept.sum()
         change = swept - x
         moved = max(float(change.max()), -float(change.min()))
         if moved <= TOLERANCE * float(swept.max()):
-            return np.asarray(swept[::-1].copy())
+            return swept[::-1].copy()
         if helps and coarse.is_due(k):
             # Where x differs much within the blocks, a coarse step undoes what the sweeps gained.
             helps, last = moved < HELPS * last, moved
