@@ -23,6 +23,7 @@ BETWEEN_OWN_PROCESSES = {
     "coordinator/studies/campaign/pool.py",
     "coordinator/studies/campaign/worker.py",
     "coordinator/learning/estimates_tables.py",
+    "services/comm/location_file/code.py",
 }
 """Files that only Python reads, whose parser accepts infinity."""
 FOR_A_HASH = {
