@@ -66,6 +66,7 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
         (
             "coordinator.task",
             "coordinator.engine",
+            "services.host.numba_kernels",
             "services.host.toml_text",
             "services.host.whole_file",
         ),
