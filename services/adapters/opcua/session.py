@@ -326,7 +326,7 @@ class OpcUaSession(Driver):
                 if wrong.endswith(CHANGED):
                     raise ConnectionError(CHANGED)  # so that types are read and values sent again
             await client.check_connection()
-            if heard.silent() > self.patience + BEAT / 1000:
+            if heard.lost(self.patience + BEAT / 1000):
                 raise ConnectionError("the server no longer serves the subscription")
 
 
@@ -368,11 +368,12 @@ class _Notifications:
         """`largest`: characters of the largest value that is kept."""
         self.names: dict[Any, list[str]] = {}
         self._largest = largest
-        self._session, self._beat = session, time.monotonic()
+        self._session, self._beat, self._ended = session, time.monotonic(), False
 
-    def silent(self) -> float:
-        """Return for how long nothing has come (s)."""
-        return time.monotonic() - self._beat
+    def lost(self, patience: float) -> bool:
+        """Return whether the server no longer serves the subscription: it has ended it, or nothing
+        has come for so long (s)."""
+        return self._ended or time.monotonic() - self._beat > patience
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Take a new value."""
@@ -390,6 +391,10 @@ class _Notifications:
         for name in self.names.get(node.nodeid, ()):  # none: the heartbeat
             item = ("bad", (name, fault)) if fault else ("value", (name, plain))
             self._session.tell(*item)
+
+    def status_change_notification(self, _: Any) -> None:
+        """The server has ended the subscription, as when it heard nothing from us for long."""
+        self._ended = True
 
 
 async def _written(

@@ -4,8 +4,8 @@
 The node `manner` decides how `request` is acknowledged: "good", "silent", "stuck" (never
 withdrawn), "blind" (it has a bad status once the request is withdrawn). Other values let something
 happen once: "retyped" (`count` becomes a text node), "forgotten" (all subscriptions are deleted),
-"bad" (`speed` has a bad status), "gone" (`count` is deleted), "begun" (`early` has a value, which
-it has not at the start).
+"ended" (clients are told that their subscriptions have ended), "bad" (`speed` has a bad status),
+"gone" (`count` is deleted), "begun" (`early` has a value, which it has not at the start).
 """
 
 from __future__ import annotations
@@ -70,6 +70,9 @@ async def trouble(server: Server, nodes: dict[str, Any], manner: str) -> None:
     if manner == "forgotten":
         service = server.iserver.subscription_service
         await service.delete_subscriptions(list(service.subscriptions))
+    elif manner == "ended":
+        for one in server.iserver.subscription_service.subscriptions.values():
+            await one.enqueue_statuschange(ua.StatusCode(ua.StatusCodes.BadTimeout))
     elif manner == "begun":
         await nodes["early"].write_value(3, ua.VariantType.Int16)
     elif manner in ("bad", "blind"):
@@ -125,7 +128,7 @@ async def serve(port: str, *security: str) -> None:
                 served = bool(request)
             elif manner == "blind" and served:
                 await trouble(server, nodes, manner)
-            if manner in ("retyped", "gone", "forgotten", "bad", "begun"):
+            if manner in ("retyped", "gone", "forgotten", "ended", "bad", "begun"):
                 await nodes["manner"].write_value("good")
                 await trouble(server, nodes, manner)
             await asyncio.sleep(0.02)

@@ -534,6 +534,17 @@ def test_what_comes_after_a_lost_subscription_is_new(cell: Cell) -> None:
 
 
 @pytest.mark.processes
+def test_a_subscription_that_the_server_ends_is_lost_at_once(cell: Cell) -> None:
+    cell.power(True)
+    driver = cell.driver(patience=10 * PATIENCE_S)
+    await_(driver, complete, "all values")
+    driver.command(0.0, {"write": {"manner": "ended"}})
+    state = await_(driver, lambda state: not state["up"], "the loss")
+    assert "no longer serves the subscription" in state["faults"]["session"]
+    await_(driver, complete, "all values")
+
+
+@pytest.mark.processes
 def test_a_node_without_a_good_value_is_a_fault_of_its_name(cell: Cell) -> None:
     cell.power(True)
     driver = cell.driver()
