@@ -1,6 +1,7 @@
 """Repeat the tests that start processes while every core is busy, and report how often each failed.
 
     python -m tools.bench.under_load 20            all tests marked `processes`
+    python -m tools.bench.under_load 3 --all       the whole suite
     python -m tools.bench.under_load 5 tests/cli   those of a folder (further arguments go to
                                                    pytest)
 
@@ -44,7 +45,7 @@ def busy_cores() -> Iterator[None]:
             burner.wait()
 
 
-def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
+def one_round(number: int, marks: str, chosen: list[str]) -> tuple[int, list[str]]:
     """Run the tests once. Return how many ran, and the names of those that failed."""
     report = KEPT / f"round-{number}.xml"
     command = [
@@ -53,8 +54,10 @@ def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
         "pytest",
         "-n",
         str(3 * (os.cpu_count() or 1)),
+        "--dist",
+        "worksteal",
         "-m",
-        "processes and not proof",
+        marks,
         f"--junitxml={report}",
         *chosen,
     ]
@@ -85,13 +88,15 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("rounds", type=int, help="how often to repeat the tests")
+    parser.add_argument("--all", action="store_true", help="the whole suite")
     options, chosen = parser.parse_known_args()
+    marks = "not proof" if options.all else "processes and not proof"
     rounds = options.rounds
     shutil.rmtree(KEPT, ignore_errors=True)
     KEPT.mkdir(parents=True)
     failures: Counter[str] = Counter()
     for number in range(1, rounds + 1):
-        ran, failed = one_round(number, chosen)
+        ran, failed = one_round(number, marks, chosen)
         failures.update(failed)
         print(
             f"round {number} of {rounds}: {ran} tests ran, {len(failed)} failed (load {load()})",
