@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,9 @@ import pytest
 from petrobot.sim.bus.ur_controller import DASHBOARD_PORT, PROGRAM_PORT, RTDE_PORT
 
 HERE = Path(__file__).parent
-HOST = "127.0.0.77"
-"""An address of this host on which nothing else has UR's fixed ports."""
+HOST = f"127.77.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"
+"""An address of this host on which nothing else, such as this test in another run of the suite, has
+UR's fixed ports."""
 ROOT = HERE.parents[2]
 
 
