@@ -478,7 +478,10 @@ class Progress(Struct, frozen=True, dict=True):
         if near:
             return f"when its tokens are there, it {' or '.join(sorted(set.union(*near)))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
-        return f"in no state at rest are the tokens that it needs ({needs}) there together"
+        text = f"in no state at rest are the tokens that it needs ({needs}) there together"
+        if any(all(state.marking[p] >= w for p, w in t.needs) for state in self.x.states):
+            text += ", with each run ended, or still active, as its arc asks"
+        return text
 
     def _outranking(self, t: CompiledTransition) -> list[str]:
         """Return the transitions that ask for no more than this one, and go first."""
