@@ -274,10 +274,11 @@ def _measure_values(measure: UserMeasure, analyses: Sequence[Analysis]) -> list[
     """Return the value of a measure in each analysis; None where it could not be computed, which
     its notes explain. Raises NetFileError."""
     values: list[float | None] = []
-    for numbers in (analysis.forecast or analysis.run for analysis in analyses):
-        value = None
-        with suppress(OutOfTime):
-            value = numbers and value_of(measure, numbers)
+    for analysis in analyses:
+        numbers, value = analysis.forecast or analysis.run, None
+        if numbers is not None:
+            with suppress(OutOfTime):
+                value = value_of(measure, numbers)
         values.append(value)
     return values
 
