@@ -867,6 +867,20 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     assert "because `ask` takes it first" in found.reason
 
 
+@pytest.mark.parametrize(
+    ("final", "said"), [("shelf == 1", "the mission ends"), ("shelf == 9", "others fire")]
+)
+def test_a_timer_that_never_fires_names_the_end_that_comes_first(final: str, said: str) -> None:
+    net: dict[str, dict[str, Any]] = {
+        "store": {"in": "bag", "out": "shelf"},
+        "full": {"in": "shelf", "out": "bag", "after": 6.0},
+        "sold": {"in": "shelf", "out": "gone", "after": 2.0},
+    }
+    found = judged(make_task("bag=1 shelf gone", net, final=final)).quasi_live
+    assert found.reason.startswith("full can never fire: ")
+    assert f"whenever its arcs are satisfied, {said} before its event or time" in found.reason
+
+
 def test_a_transition_that_never_fires_tells_tokens_from_ends_of_runs() -> None:
     """Both runs are there at once, but the first error ends the other run before it can fail."""
     net: dict[str, dict[str, Any]] = {
