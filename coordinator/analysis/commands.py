@@ -142,6 +142,9 @@ def analyse_command(
         with until(due, clock):
             model = open_model(path)
         view = view or _view(model, rates)
+        if expressions and view == "ordinary":
+            why = "the ordinary view has no times: give --view gspn"
+            raise NetFileError("--measure", expressions[0].text, "there are no numbers", why)
         subject, name, notes = _subject(model, rates, view)
         cell = _cell(model, cell_of)
         known = _measured(model, measure, cell)
@@ -187,8 +190,9 @@ def analyse_command(
         return full
     notes = (*notes, *_raised_by(analyses[-1]))
     said += [wrapped(f"note: {note}", 4) for note in notes]
+    answered = None not in data.get("measures", {}).values()
     return CommandResult(
-        OK if analyses[-1].ok else FAULT,
+        OK if analyses[-1].ok and answered else FAULT,
         "\n".join(said),
         data | {"notes": [*data["notes"], *notes]},
         analysis=analyses[-1],
@@ -266,15 +270,16 @@ def _played(plays: MissionFigures, word: str, given: float, value: float) -> tup
     return there, min(bdtr(count, n, share), bdtrc(count - 1, n, share) if count else 1.0)
 
 
-def _measure_values(measure: UserMeasure, analyses: Sequence[Analysis]) -> list[float]:
-    """Return the value of a measure in each analysis. Raises NetFileError."""
-    values = []
+def _measure_values(measure: UserMeasure, analyses: Sequence[Analysis]) -> list[float | None]:
+    """Return the value of a measure in each analysis; None where it could not be computed, which
+    its notes explain. Raises NetFileError."""
+    values: list[float | None] = []
     for analysis in analyses:
-        numbers = analysis.forecast or analysis.run
-        if numbers is None:
-            why = "; ".join(analysis.notes) or "the ordinary view has no times: give --view gspn"
-            raise NetFileError("--measure", measure.text, "there are no numbers", why)
-        values.append(value_of(measure, numbers))
+        numbers, value = analysis.forecast or analysis.run, None
+        if numbers is not None:
+            with suppress(OutOfTime):
+                value = value_of(measure, numbers)
+        values.append(value)
     return values
 
 

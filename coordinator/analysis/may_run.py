@@ -22,7 +22,7 @@ from petrobot.coordinator.task.check.completeness import (
     external_waits,
     uncovered_exits,
 )
-from petrobot.coordinator.task.check.conflicts import lent
+from petrobot.coordinator.task.check.conflicts import idle_weights, lent
 from petrobot.coordinator.task.check.findings import subnet_of, subnets_of
 from petrobot.coordinator.task.validation import is_pulse
 from petrobot.coordinator.task.wording import listed, wrapped
@@ -181,7 +181,7 @@ def _with_graph(task: Task, report: CheckReport, analysis: Analysis) -> CheckRep
     rest += external_waits(analysis.progress.x.engine.compiled.task, may_stay=may_stay)
     flat = analysis.progress.x.engine.compiled.task
     found = [
-        _contest(contest)
+        _contest(flat, contest)
         for contest in analysis.progress.contests
         if contest.matters or not _lent(flat, contest)
     ]
@@ -191,6 +191,7 @@ def _with_graph(task: Task, report: CheckReport, analysis: Analysis) -> CheckRep
         found.append(_ends_by_error(late))
     found += _lost_pulses(analysis.progress.x)
     found += _awaited_ends(task, analysis.progress.x)
+    found += _more_runs(analysis.progress.x)
     found += _uncovered(analysis.progress.x) if open_ones else ()
     errors = [f for f in found if f.severity is Severity.ERROR]
     others = [f for f in found if f.severity is not Severity.ERROR]
@@ -323,6 +324,31 @@ def _lost_pulses(x: ExecutionGraph) -> Iterator[Finding]:
                 yield Finding(Severity.NOTE, "lost-pulse", key, text, remedy)
 
 
+def _more_runs(x: ExecutionGraph) -> Iterator[Finding]:
+    """The runs place, if it may come to hold more tokens than at the beginning."""
+    task, net = x.engine.compiled.task, x.engine.compiled.net
+    p = net.place_index.get(task.runs_place, -1)
+    changes = zip(net.transitions, net.compiled.changes, strict=True)
+    moved = {t: dict(change)[p] for t, change in changes if p in dict(change)}
+    if not any(change > 0 for change in moved.values()):
+        return
+    most = 0
+    edges = zip(x.source[~x.by_hand].tolist(), x.label[~x.by_hand].tolist(), strict=True)
+    for source, label in edges:
+        held = x.states[source].marking[p]
+        for t in x.steps[label].firings:
+            held += moved.get(t, 0)
+            most = max(most, held)
+    if most > net.initial[p]:
+        text = (
+            f"{task.runs_place} can hold {most} tokens, more than the {net.initial[p]} of the "
+            "beginning: a campaign has one row for each of these alone, and forecasts count goals "
+            "for each of them"
+        )
+        remedy = "let what is to be done again wait in another place, or return one token at most"
+        yield Finding(Severity.NOTE, "more-runs", "task.runs_place", text, remedy)
+
+
 def _awaited_ends(task: Task, x: ExecutionGraph) -> Iterator[Finding]:
     """Places that only an external event empties, while nothing but their tokens keeps the task
     from its end: `final` as it is written holds, and asks for nothing there."""
@@ -361,11 +387,12 @@ def _lent(task: Task, contest: Contest) -> bool:
     return all({*contest.over} <= lent(task, t, u) for t, u in combinations(rivals, 2))
 
 
-def _contest(contest: Contest) -> Finding:
+def _contest(task: Task, contest: Contest) -> Finding:
     from petrobot.coordinator.analysis.execution.progress import contend
 
     first, *others = contest.transitions
     text, key = contend(contest.transitions, contest.over), f"transitions.{first}"
+    text += idle_weights(task.transitions[name] for name in contest.transitions)
     remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
     who = "the one that has waited longer gets it, or else the first in the file"
     if not contest.matters:

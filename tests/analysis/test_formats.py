@@ -339,6 +339,11 @@ PNPRO = """<?xml version="1.0"?><project name="P" version="121"><gspn name="G"><
 </edges></gspn></project>"""
 
 
+def test_a_greatspn_project_under_another_ending_is_named() -> None:
+    with pytest.raises(NetFileError, match=r"this is not PNML; .* read as \.pnpro: rename"):
+        parse_pnml(PNPRO)
+
+
 def test_delays_in_greatspn_projects_are_rates() -> None:
     model = parse_pnpro(PNPRO)
     assert model.gspn is not None and model.net == model.gspn.net

@@ -108,13 +108,25 @@ def test_the_distribution_of_times_is_computed_once_and_its_lack_costs_no_other_
 
     monkeypatch.setattr(task_forecast, "completion_time", counted)
     changes = ["grip.error.share=0.05"]
-    measures = ["p95=time(0.95)", "p80=time(0.8)"] if not late else []
+    measures = ["p95=time(0.95)", "p80=time(0.8)"]
     outcome = analyse_command(path, view="gspn", changes=changes, measures=measures)
     _, _, table = outcome.text.partition("what if grip.error.share=0.05:")
     assert outcome.data["forecast"]["mean"] == pytest.approx(3 / 0.95)
     assert "mean" in table and ("90 % quantile" in table) is not late
     assert outcome.text.count("the time was used up") == outcome.data["notes"].count(LATE) == late
     assert len(computed) == (0 if late else 2)  # of each file once, not for each number again
+    assert [value is None for value in outcome.data["measures"].values()] == [late, late]
+    assert outcome.code == late
+
+
+def test_a_measure_that_a_limit_leaves_unknown_costs_no_verdict(tmp_path: Path) -> None:
+    """The input is good, so this is not exit code 2; but not every answer is known."""
+    path = tmp_path / "task.toml"
+    path.write_text(GRIPS, encoding="utf-8")
+    limits = SearchLimits(states=8)  # enough for N, too few for the chain
+    outcome = analyse_command(path, view="gspn", limits=limits, measures=["p95=time(0.95)"])
+    assert outcome.code == 1 and outcome.data["measures"] == {"p95": None}
+    assert "deadlock free" in outcome.text and "no forecast: " in outcome.text
 
 
 GRIPS = """schema = 1

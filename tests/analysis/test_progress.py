@@ -867,6 +867,36 @@ def test_a_transition_that_never_fires_names_who_takes_its_tokens_first() -> Non
     assert "because `ask` takes it first" in found.reason
 
 
+@pytest.mark.parametrize(
+    ("final", "said"), [("shelf == 1", "the mission ends"), ("shelf == 9", "others fire")]
+)
+def test_a_timer_that_never_fires_names_the_end_that_comes_first(final: str, said: str) -> None:
+    net: dict[str, dict[str, Any]] = {
+        "store": {"in": "bag", "out": "shelf"},
+        "full": {"in": "shelf", "out": "bag", "after": 6.0},
+        "sold": {"in": "shelf", "out": "gone", "after": 2.0},
+    }
+    found = judged(make_task("bag=1 shelf gone", net, final=final)).quasi_live
+    assert found.reason.startswith("full can never fire: ")
+    assert f"whenever its arcs are satisfied, {said} before its event or time" in found.reason
+
+
+def test_a_transition_that_never_fires_tells_tokens_from_ends_of_runs() -> None:
+    """Both runs are there at once, but the first error ends the other run before it can fail."""
+    net: dict[str, dict[str, Any]] = {
+        "split": {"in": "part", "out": "near far"},
+        "join": {"in": "near:normal far:normal", "out": "done"},
+        "both": {"in": "near:error far:error", "out": "done"},
+        "one": {"in": "near:error far:preempt=none", "out": "done"},
+        "other": {"in": "far:error near:preempt=none", "out": "done"},
+    }
+    found = judged(make_task("part=1 near! far! done", net, final="done == 1")).quasi_live
+    assert found.reason == (
+        "both can never fire: in no state at rest are the tokens that it needs (near, far) there "
+        "together, with each run ended, or still active, as its arc asks"
+    )
+
+
 def test_a_transition_that_never_fires_names_who_goes_first_by_priority() -> None:
     """Its tokens are left there only where the task has given up: that bars it, and is no cause."""
     net: dict[str, dict[str, Any]] = {
@@ -1376,6 +1406,40 @@ def test_a_conflict_is_a_note_unless_a_verdict_depends_on_it(gone: str, matters:
     assert answer.ok is not matters
     assert ("deadlock free: stuck with b" in found.text) is matters
     assert ("second may have to wait" in found.remedy) is not matters
+
+
+@pytest.mark.parametrize(
+    ("weights", "told"),
+    [((2.0, None), "the weight of first does not count: second has none"), ((None, None), "")],
+)
+def test_a_weight_that_does_not_count_is_named(
+    weights: tuple[float | None, float | None], told: str
+) -> None:
+    """The engine draws only if all rivals have a weight."""
+    net: dict[str, dict[str, Any]] = {
+        "first": {"in": "token", "out": "a", "weight": weights[0]},
+        "second": {"in": "token", "out": "b", "weight": weights[1]},
+    }
+    task = make_task("token=1 a b", net, final="a == 1 or b == 1")
+    for budget in (Budget(), None):  # on the graph, and on the arcs alone
+        report = may_run(task, None, budget).report
+        (found,) = (f for f in report.findings if f.code == "unsettled-conflict")
+        assert told in found.text and ("weight" in found.text) is bool(told)
+
+
+@pytest.mark.parametrize(("given", "most"), [("runs", 0), ("runs*2", 2)])
+def test_a_runs_place_that_grows_is_noted(given: str, most: int) -> None:
+    """A campaign has one row for each token of the beginning, whatever is added later."""
+    net: dict[str, dict[str, Any]] = {
+        "go": {"in": "runs", "out": "look"},
+        "seen": {"in": "look:normal"},
+        "again": {"in": "look:error spare", "out": given},
+        "lost": {"in": "look:error !spare"},
+    }
+    task = make_task("runs=1 spare=2 look!", net, final="runs == 0", runs_place="runs")
+    found = [f for f in may_run(task, None, Budget()).report.findings if f.code == "more-runs"]
+    assert len(found) == (most > 0)
+    assert all(f"runs can hold {most} tokens, more than the 1" in f.text for f in found)
 
 
 def test_transitions_that_are_never_enabled_together_are_not_a_conflict() -> None:

@@ -181,6 +181,14 @@ def test_kanban_is_live_reversible_and_bounded() -> None:
     assert result.home_states == 4600 and set(result.levels) == {4}
 
 
+def test_safe_says_how_many_tokens_its_witness_shows() -> None:
+    """Not the most that any marking has: the first marking with two is shown."""
+    net = Net(("p", "s"), ("t",), (((1, 1),),), (((0, 2),),), ((),), (0, 2), (None, None), (0,))
+    found = examine(explore(net)).safe
+    assert found.reason == "p can hold 2 tokens"
+    assert found.witness is not None and found.witness.marking == {"p": 2, "s": 1}
+
+
 def test_an_unbounded_net_has_a_pump_and_unknown_verdicts() -> None:
     net = Net.build(
         {"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})}

@@ -173,3 +173,40 @@ def test_simulation_accepts_the_same_changes() -> None:
         return float(outcome.data["time"][0])
 
     assert mean("runs=2") == pytest.approx(2 * mean("runs=1"), rel=0.1)
+
+
+def test_the_rate_of_a_transition_includes_its_copies_for_tries(tmp_path: Path) -> None:
+    """The file has one `put`; each part is put once, after a second try too."""
+    path = tmp_path / "task.toml"
+    path.write_text(
+        """schema = 1
+[task]
+name = "t"
+final = "parts == 0 and hand == 1"
+[primitive_tasks.grip]
+deadline = 900.0
+[primitive_tasks.grip.estimates]
+success = { share = 0.5, mean = 1.0, cv = 1.0 }
+error = { share = 0.5, mean = 1.0, cv = 1.0 }
+[places]
+parts = { kind = "control", tokens = 1 }
+hand = { kind = "resource", tokens = 1 }
+grip = { kind = "action", tries = 2 }
+[transitions]
+next = { in = ["parts", "hand"], out = ["grip"] }
+put = { in = ["grip:normal"], out = ["hand"] }
+drop = { in = ["grip:error"], out = ["hand"] }
+""",
+        encoding="utf-8",
+    )
+    measures = ["put=rate(put)*mean", "second=rate(put.1)*mean"]
+    found = analyse_command(path, view="gspn", measures=measures).data["measures"]
+    assert found == pytest.approx({"put": 0.75, "second": 0.25})
+
+
+def test_a_measure_that_a_net_does_not_have_names_those_that_it_has(tmp_path: Path) -> None:
+    path = tmp_path / "queue.net"
+    path.write_text("pl free (2)\ntr arrive free -> busy\ntr serve busy -> free\n", "utf-8")
+    found = analyse_command(path, rates="unit", measures=["late(3)"])
+    assert found.code == 2
+    assert found.text.endswith("; write an expression of rate(T), tokens(P), marked(P)")

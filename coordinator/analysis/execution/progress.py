@@ -448,14 +448,19 @@ class Progress(Struct, frozen=True, dict=True):
         compiled = self.x.engine.compiled
         lacking: list[set[str]] = []
         near: list[set[str]] = []
-        for state in self.x.states:
+        ready: list[int] = []
+        for i, state in enumerate(self.x.states):
             draft = Draft(compiled, state)
             found = obstacles(draft, t)
             lacking.append({_lack(one.kind, one.text) for one in found})
             if not any(one.kind in ("short", "run") for one in found):
                 near.append({_lack(one.kind, obstacle_text(draft, t, one)) for one in found})
             if not found:
-                return "whenever its arcs are satisfied, others fire before its event or time comes"
+                ready.append(i)
+        if ready:
+            over = (self.x.final | self.x.given_up)[ready].all()
+            what = "the mission ends" if over else "others fire"
+            return f"whenever its arcs are satisfied, {what} before its event or time comes"
         always, net, empty = set.intersection(*lacking), compiled.net, list[str]()
         for p, w in t.plain:
             givers, most = self._givers(p), most_tokens(net)[p]
@@ -478,7 +483,10 @@ class Progress(Struct, frozen=True, dict=True):
         if near:
             return f"when its tokens are there, it {' or '.join(sorted(set.union(*near)))}"
         needs = ", ".join(net.places[p] for p, _ in t.needs)
-        return f"in no state at rest are the tokens that it needs ({needs}) there together"
+        text = f"in no state at rest are the tokens that it needs ({needs}) there together"
+        if any(all(state.marking[p] >= w for p, w in t.needs) for state in self.x.states):
+            text += ", with each run ended, or still active, as its arc asks"
+        return text
 
     def _outranking(self, t: CompiledTransition) -> list[str]:
         """Return the transitions that ask for no more than this one, and go first."""

@@ -256,9 +256,10 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
     """Read the net in a PNML text. Raises NetFileError."""
     root = parse_tree(text, file)
     if local(root) not in ("pnml", "net"):
-        raise NetFileError(
-            file, f"<{local(root)}>", "this is not PNML", "expected <pnml>", line=root.line
-        )
+        remedy = "expected <pnml>"
+        if local(root) == "project":
+            remedy = "a project of GreatSPN is read as .pnpro: rename the file"
+        raise NetFileError(file, f"<{local(root)}>", "this is not PNML", remedy, line=root.line)
     notes = check(file, root, ROOT, "pnml") if local(root) == "pnml" else []
     for feature in children(root, "feature"):
         notes += check(file, feature, FEATURE, "feature")

@@ -541,10 +541,11 @@ def _safe(
 ) -> PropertyVerdict:
     for p, (place, most) in enumerate(zip(n.task.net.places, seen, strict=True)):
         if most > 1:
-            first = int(np.argmax(n.held(space, p) > 1))
+            tokens = n.held(space, p)
+            first = int(np.argmax(tokens > 1))
             firings = tuple(n.origin[t] for t in space.path(first) if t in n.origin)
             shown = Witness(firings, _marked(n, n.projected(space.marking(first))))
-            reason = f"{place} can hold {most} tokens"
+            reason = f"{place} can hold {tokens[first]} tokens"
             return PropertyVerdict(False, reason, shown, complete=space.complete)
     if all(b is not None and b <= 1 for b in bounds):
         text = "no place ever holds more than one token"

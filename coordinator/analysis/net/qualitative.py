@@ -198,8 +198,9 @@ def _marked(net: Net, firings: tuple[str, ...]) -> dict[str, int]:
 def _safe(space: Space, proven: bool) -> PropertyVerdict:
     for p, most in enumerate(space.bounds):
         if most > 1:
-            first = int(np.argmax(space.tokens(p) > 1))
-            reason = f"{space.net.places[p]} can hold {most} tokens"
+            tokens = space.tokens(p)
+            first = int(np.argmax(tokens > 1))
+            reason = f"{space.net.places[p]} can hold {tokens[first]} tokens"
             return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     if proven:
         return PropertyVerdict(

@@ -5,7 +5,8 @@ Written as an expression, if wanted with a name in front: `late=late(20)`, `time
 
 - `time(Q)`: the time (s) by which a share Q of the completing mission runs has completed;
 - `late(S)`: the probability that a mission run has not completed within S seconds;
-- `rate(TRANSITION)`: its firings per second; of a task in mission runs without pauses;
+- `rate(TRANSITION)`: its firings per second, with those of the copies that `tries` made of it; of a
+  task in mission runs without pauses;
 - `tokens(PLACE)`, `marked(PLACE)`: time average of its tokens, share of time with any token;
 - `P_complete`, `R_goal`, `R_conj`, `mean` (s): as in the forecast.
 """
@@ -24,7 +25,8 @@ from petrobot.coordinator.analysis.time.markov import LongRun
 from petrobot.coordinator.analysis.time.task_forecast import Forecast
 
 CALL = re.compile(r"([A-Za-z_]\w*)\(\s*([^()]*?)\s*\)")
-FORM = "write an expression of time(Q), late(S), rate(T), tokens(P), marked(P), mean, P_complete"
+LONG_RUN = "rate(T), tokens(P), marked(P)"
+FORM = f"write an expression of time(Q), late(S), {LONG_RUN}, mean, P_complete"
 
 
 class Measure(Struct, frozen=True):
@@ -55,7 +57,7 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
     """Return the value of a measure. Raises NetFileError."""
     numbers: dict[str, Callable[[], float | None]] = {}
     calls: dict[str, Callable[[str], float]] = {
-        "rate": lambda name: _named(measure, "transition", name, found.throughput),
+        "rate": lambda name: _rate(measure, name, found),
         "tokens": lambda name: _named(measure, "place", name, found.mean_tokens),
         "marked": lambda name: _named(measure, "place", name, found.occupancy),
     }
@@ -71,6 +73,7 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
             "mean": lambda: found.done.mean,
         }
     names: dict[str, Fraction] = {}
+    form = FORM if isinstance(found, Forecast) else f"write an expression of {LONG_RUN}"
 
     def exact(value: float | None, what: str) -> Fraction:
         if value is None or not isfinite(value):
@@ -80,7 +83,7 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
     def called(match: re.Match[str]) -> str:
         word, argument = match.groups()
         if word not in calls:
-            raise _fault(measure, f"unknown measure {word}(...)", FORM)
+            raise _fault(measure, f"unknown measure {word}(...)", form)
         name = f"value_{len(names)}"
         names[name] = exact(calls[word](argument), match[0])
         return f" {name} "
@@ -96,7 +99,7 @@ def value_of(measure: Measure, found: Forecast | LongRun) -> float:
     except ZeroDivisionError as error:
         raise _fault(measure, "a division by 0", "divide by what is not 0 here") from error
     except ValueError as error:
-        raise _fault(measure, str(error), FORM) from error
+        raise _fault(measure, str(error), form) from error
 
 
 def _late(found: Forecast, seconds: float) -> float:
@@ -106,6 +109,14 @@ def _late(found: Forecast, seconds: float) -> float:
 
 def _fault(measure: Measure, problem: str, remedy: str) -> NetFileError:
     return NetFileError("--measure", measure.text, problem, remedy)
+
+
+def _rate(measure: Measure, name: str, found: Forecast | LongRun) -> float:
+    rate = _named(measure, "transition", name, found.throughput)
+    if isinstance(found, Forecast):
+        of_task = found.view.task.flat.transitions.values()
+        rate += sum(found.throughput[t.name] for t in of_task if t.expanded_from == name)
+    return rate
 
 
 def _named(measure: Measure, what: str, name: str, known: dict[str, float]) -> float:

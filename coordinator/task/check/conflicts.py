@@ -10,7 +10,7 @@ and arrival order decides.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import combinations
 from math import gcd
 
@@ -166,10 +166,21 @@ def _judge(
     )
     text = (
         f"{t.name} and {u.name} may both want the last token of {over}, and the task does not say "
-        f"which one gets it{unsure}"
+        f"which one gets it{unsure}{idle_weights((t, u))}"
     )
     remedy = "give one a higher `priority`, each a `weight`, or exclusive conditions"
     yield Finding(Severity.WARNING, "unsettled-conflict", key, text, remedy, verdict.witness)
+
+
+def idle_weights(rivals: Iterable[Transition]) -> str:
+    """Return that the weights of some rivals do not count, as the others have none; else empty."""
+    by_weight: dict[bool, list[str]] = {True: [], False: []}
+    for t in rivals:
+        by_weight[t.weight is not None].append(t.name)
+    if not all(by_weight.values()):
+        return ""
+    some, none = (" and ".join(by_weight[has]) for has in (True, False))
+    return f" (the weight of {some} does not count: {none} has none)"
 
 
 def _elapse_together(t: Transition, u: Transition) -> bool:
