@@ -62,6 +62,8 @@ class OpcUaSession(Driver):
             raise ImportError('OPC UA needs asyncua: pip install "petrobot[opcua]"') from fault
         # Its warnings repeat, at each attempt, what `faults` says once.
         logging.getLogger("asyncua").setLevel(logging.ERROR)
+        # It calls a connection that is lost while it waits a crash; this driver says it itself.
+        logging.getLogger("asyncua.client").setLevel(logging.CRITICAL)
         self._keys: dict[str, tuple[Any, bytes, str]] = {}
         """By key: what the file holds, its content, "der" or "pem"."""
         self._password = ports.file(self.password_file).decode().strip("\r\n") if self.user else ""

@@ -120,7 +120,7 @@ def pace(now: float) -> None:
 
 
 @pytest.mark.processes
-def test_values_writes_events_and_a_restart(cell: Cell) -> None:
+def test_values_writes_events_and_a_restart(cell: Cell, caplog: pytest.LogCaptureFixture) -> None:
     cell.power(True)
     driver = cell.driver(events={"part": {"node": "sensor", "becomes": True}})
     assert not driver.stopped()
@@ -150,6 +150,8 @@ def test_values_writes_events_and_a_restart(cell: Cell) -> None:
     cell.power(True)
     await_(driver, complete, "the values after the restart")
     assert done(driver, {"count": 1}) == "" and len(cell.desk.events) == 2
+    lines = [record.getMessage() for record in caplog.records if record.name != "asyncio"]
+    assert lines and all(line.startswith("no connection to the device") for line in lines)
 
 
 @pytest.mark.processes
