@@ -189,9 +189,10 @@ class OpcUaSession(Driver):
 
     def state(self) -> Mapping[str, Any]:
         """Return plain data; see the docstring of this module."""
+        up = "session" not in self.faults
         return {
-            "up": "session" not in self.faults,
-            "values": dict(self.values),
+            "up": up,
+            "values": dict(self.values) if up else {},  # what is read can be written, too
             "faults": dict(self.faults),
             "asked": self._asked,
             "done": self._done,

@@ -285,20 +285,20 @@ def test_values_of_any_type_are_plain(cell: Cell) -> None:
     data = SimpleNamespace(monitored_item=item)
     heard.datachange_notification(SimpleNamespace(nodeid="node"), dates, data)
     driver.step(0.0)
-    told = plain(driver.state())["values"]["count"]
+    told = plain(driver.values)["count"]
     assert told == ["2026-11-23 00:00:00", ["2026-11-24 00:00:00"], 3]
     heard.datachange_notification(SimpleNamespace(nodeid="node"), b"F\xfcll".decode(**LATIN), data)
     driver.step(0.0)
-    assert plain(driver.state())["values"]["count"] == "F?ll"
+    assert plain(driver.values)["count"] == "F?ll"
     heard.datachange_notification(SimpleNamespace(nodeid="node"), None, data)
     driver.step(0.0)
-    assert "no value" in driver.state()["faults"]["count"] and not driver.state()["values"]
+    assert "no value" in driver.state()["faults"]["count"] and not driver.values
     heard.datachange_notification(SimpleNamespace(nodeid="node"), "x" * 1001, data)
     driver.step(0.0)
-    assert "longer than 1000" in driver.state()["faults"]["count"] and not driver.state()["values"]
+    assert "longer than 1000" in driver.state()["faults"]["count"] and not driver.values
     heard.datachange_notification(SimpleNamespace(nodeid="node"), [1.0, float("nan")], data)
     driver.step(0.0)
-    assert "NaN" in driver.state()["faults"]["count"] and not driver.state()["values"]
+    assert "NaN" in driver.state()["faults"]["count"] and not driver.values
 
 
 @pytest.mark.processes
