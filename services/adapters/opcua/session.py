@@ -62,7 +62,7 @@ class OpcUaSession(Driver):
             raise ImportError('OPC UA needs asyncua: pip install "petrobot[opcua]"') from fault
         # Its warnings repeat, at each attempt, what `faults` says once.
         logging.getLogger("asyncua").setLevel(logging.ERROR)
-        # It calls a connection that is lost while it waits a crash; this driver says it itself.
+        # It logs each lost connection as a crash; this driver reports the loss itself.
         logging.getLogger("asyncua.client").setLevel(logging.CRITICAL)
         self._keys: dict[str, tuple[Any, bytes, str]] = {}
         """By key: what the file holds, its content, "der" or "pem"."""
@@ -396,7 +396,7 @@ class _Notifications:
             self._session.tell(*item)
 
     def status_change_notification(self, _: Any) -> None:
-        """The server has ended the subscription, as when it heard nothing from us for long."""
+        """Note that the server has ended the subscription, as it does after a long silence."""
         self._ended = True
 
 
