@@ -115,7 +115,7 @@ def _rate(measure: Measure, name: str, found: Forecast | LongRun) -> float:
     rate = _named(measure, "transition", name, found.throughput)
     if isinstance(found, Forecast):
         of_task = found.view.task.flat.transitions.values()
-        rate += sum(found.throughput[t.name] for t in of_task if t.expanded_from == name)
+        rate += sum(found.throughput[t.name] for t in of_task if t.copy_of == name != t.name)
     return rate
 
 
