@@ -35,7 +35,7 @@ class CameraDriver(Driver):
     """
 
     source: str = key(text='where images come from, such as "capture:0"')
-    rate: float = key(0.0, "images/s; 0: the usual rate of this camera")
+    rate: float = key(0.0, "images/s; 0: the usual rate of this camera", least=0)
     threads: int = key(1, "of OpenCV: other nodes share the cores")
 
     usual_rate = 25.0

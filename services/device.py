@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import logging
 import math
+import operator
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from inspect import getattr_static, iscoroutinefunction, isfunction, signature
@@ -20,6 +21,7 @@ from types import NoneType, UnionType
 from typing import (
     TYPE_CHECKING,
     Any,
+    Final,
     Protocol,
     Union,
     get_args,
@@ -134,12 +136,23 @@ class _Required:
     """Default of a required key."""
 
 
+_BOUNDS: Final[Mapping[str, tuple[str, Callable[[float, float], bool]]]] = {
+    "above": ("above", operator.gt),
+    "least": ("of at least", operator.ge),
+    "most": ("at most", operator.le),
+}
+
+
 class Key:
     """A key of a device's table, declared by `key`."""
 
-    def __init__(self, default: Any, text: str) -> None:
+    def __init__(
+        self, default: Any, text: str, bounds: Mapping[str, float], choices: tuple[str, ...]
+    ) -> None:
         self.default = default
         self.text = text
+        self.bounds = bounds
+        self.choices = choices
         self.name = ""
         self.kind: type = object
         """Type of the value: bool, int, float, str, list or dict; object: any plain data."""
@@ -173,14 +186,14 @@ class Key:
         default = self.default
         if self.kind is list and isinstance(default, tuple):
             default = [*default]
-        if default is not _Required and default is not None and not self._is_typed(default):
+        if default is not _Required and default is not None and not self._fits(default):
             text = f"expected {self._expected()}, found the default {default!r:.60}"
             return f"{text} of its `key`; correct it or the annotation in the driver"
         if self.name not in config:
             return f"is missing; give {self._expected()}" if default is _Required else ""
         value = config[self.name]
         endless = isinstance(value, float) and not math.isfinite(value)
-        fits = self._is_typed(value) and not endless
+        fits = self._fits(value) and not endless
         return "" if fits else f"expected {self._expected()}, found {value!r:.60}"
 
     def read(self, config: Mapping[str, Any]) -> Any:
@@ -188,10 +201,14 @@ class Key:
         value = config.get(self.name, self.default)
         return float(value) if self.kind is float and value is not None else copy(value)
 
-    def _is_typed(self, value: Any) -> bool:
+    def _fits(self, value: Any) -> bool:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         fits = number if self.kind is float else isinstance(value, self.kind)
-        return fits and (number or self.kind is not int)
+        if not fits or (self.kind is int and not number):
+            return False
+        if self.choices:
+            return value in self.choices
+        return not number or all(_BOUNDS[b][1](value, end) for b, end in self.bounds.items())
 
     def _expected(self) -> str:
         words = {
@@ -202,7 +219,10 @@ class Key:
             list: "a list",
             dict: "a table",
         }
-        return words.get(self.kind, "a value") + (f" ({self.text})" if self.text else "")
+        limits = " and ".join(f"{_BOUNDS[b][0]} {end:g}" for b, end in self.bounds.items())
+        wish = " ".join(filter(None, (words.get(self.kind, "a value"), limits)))
+        wish = " or ".join(f'"{text}"' for text in self.choices) or wish
+        return wish + (f" ({self.text})" if self.text else "")
 
 
 def _type_word(said: Any) -> str:
@@ -216,14 +236,25 @@ def _type_word(said: Any) -> str:
     return words.pop() if len(words) == 1 else ""
 
 
-def key(default: Any = _Required, text: str = "") -> Any:
+def key(
+    default: Any = _Required,
+    text: str = "",
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+    choices: Iterable[str] = (),
+) -> Any:
     """Declare a key of a device's table in services.toml as an attribute of its driver.
 
-    `port: str = key(text="serial port")` is required, `speed = key(0.1, "m/s")` has a default. The
-    type is that of the annotation, else of the default. The driver reads the value as
-    `self.port`; a missing, unknown or mistyped key is refused by name.
+    `port: str = key(text="serial port")` is required, `speed = key(0.1, "m/s", above=0, most=2)`
+    has a default and limits, `side = key("left", choices=("left", "right"))` is one of some texts.
+    The type is that of the annotation, else of the default. The driver reads the value as
+    `self.port`; a missing, unknown or wrong key is refused by name.
     """
-    return Key(default, text)
+    given = {"above": above, "least": least, "most": most}
+    bounds = {name: end for name, end in given.items() if end is not None}
+    return Key(default, text, bounds, tuple(choices))
 
 
 class Workspace:

@@ -34,8 +34,8 @@ class Axis(Driver):
     """Where it moves to (m); None after `stop`."""
     allowed: float = math.inf
     """No faster than this at present (m/s). `step` may set it, also to 0."""
-    top_speed: float = key(0.5, "m/s")
-    acceleration: float = key(4.0, "m/s^2")
+    top_speed: float = key(0.5, "m/s", above=0)
+    acceleration: float = key(4.0, "m/s^2", above=0)
     stations: dict[str, float] = key({}, "positions by name, m")
     ends: list[float] = key([], "least and greatest position, m; if empty, those of the stations")
     _share = 1.0
@@ -54,9 +54,6 @@ class Axis(Driver):
             raise ValueError(f"ends: expected [least, greatest] position, found {self.ends}")
         if beyond := [name for name, at in self.stations.items() if not low <= at <= high]:
             raise ValueError(f"stations: {', '.join(beyond)} lies beyond the ends {self.ends} m")
-        for name in ("top_speed", "acceleration"):
-            if not (value := getattr(self, name)) > 0.0:
-                raise ValueError(f"{name}: expected a number above 0, found {value:g}")
         if self.along not in ("x", "y", "z"):
             raise ValueError(f"along: expected x, y or z in the driver, found {self.along!r}")
         self.at = min(high, max(low, self.at))

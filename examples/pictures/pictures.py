@@ -7,7 +7,7 @@ from petrobot import Context, Driver, Result, failure, key, success
 class Camera(Driver):
     """Takes noisy pictures of one point; each gives its position with an error."""
 
-    noise: float = key(1.0, "pixels, standard deviation in each direction")
+    noise: float = key(1.0, "pixels, standard deviation in each direction", least=0)
 
     def locate(self) -> tuple[float, float]:
         x, y = self.ports.random("pictures").normal(0.0, self.noise, 2)

@@ -16,7 +16,7 @@ class Base(Axis):
     obeys = (*Axis.obeys, "dry_run")
     stations = STATIONS
     top_speed = 1.0
-    blind: float = key(0.4, "m/s while nobody watches the corridor")
+    blind: float = key(0.4, "m/s while nobody watches the corridor", above=0)
 
     def step(self, now: float) -> None:
         limit = self.ports.stream("limit").values
@@ -30,7 +30,7 @@ class Gripper(Axis):
     period = 0.02
     obeys = (*Axis.obeys, "dry_run")
     stations = OPENINGS
-    slips: float = key(0.2, "share of the parts that slip out")
+    slips: float = key(0.2, "share of the parts that slip out", least=0, most=1)
 
     def setup(self) -> None:
         self.holds = False
@@ -47,7 +47,7 @@ class Gripper(Axis):
 class Reader(Driver):
     """Reads barcodes; this one makes them up."""
 
-    unreadable: float = key(0.1, "share of the codes that cannot be read")
+    unreadable: float = key(0.1, "share of the codes that cannot be read", least=0, most=1)
 
     def read(self) -> str | None:
         draws = self.ports.random("code")
@@ -58,7 +58,7 @@ class Button(Driver):
     """Somebody presses it now and then; a real one would read a pin in `step`."""
 
     period = 0.1
-    every: float = key(6.0, "s, mean time between two presses")
+    every: float = key(6.0, "s, mean time between two presses", above=0)
 
     def step(self, now: float) -> None:
         if self.ports.random("press").random() < self.period / self.every:

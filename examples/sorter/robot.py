@@ -19,7 +19,7 @@ class Arm(Axis):
 class Scanner(Driver):
     """Reads barcodes; this one makes them up."""
 
-    unreadable: float = key(0.1, "share of the codes that cannot be read")
+    unreadable: float = key(0.1, "share of the codes that cannot be read", least=0, most=1)
 
     def read(self) -> str | None:
         draws = self.ports.random("code")

@@ -116,15 +116,13 @@ class Arm(Driver):
     period: float | None = PERIOD
     obeys = (*LIMITS, "pause")
     stream: str = key("catch_point", "stream of catch points")
-    stream_period: float = key(0.02, "s")
+    stream_period: float = key(0.02, "s", above=0)
     enable: bool = key(True, "enable the drives at the start")
     model: str = key("", "file of the arm, instead of the shipped one")
     cell: str = key("", "file of the cell, instead of the shipped one")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
-        if not self.stream_period > 0.0:
-            raise ValueError(f"stream_period: expected seconds above 0, found {self.stream_period}")
         model = read_arm(ports.file(self.model).decode()) if self.model else nominal_arm()
         cell = read_cell(ports.file(self.cell).decode()) if self.cell else nominal_cell()
         self._poses = model.poses

@@ -306,6 +306,12 @@ IN_THE_CELL: list[Mistake] = [
     (
         CELL,
         "speed = 0.5",
+        "speed = 0",
+        r":LINE: devices.axis.top_speed: expected a number above 0 \(m/s\), found 0",
+    ),
+    (
+        CELL,
+        "speed = 0.5",
         "sped = 0.5",
         r":LINE: devices.axis.top_sped: unknown key; did you mean 'top_speed'",
     ),

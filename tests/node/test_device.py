@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from functools import wraps
 from pathlib import Path
@@ -97,6 +98,39 @@ def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> N
     assert words in str(fault.value)
     with pytest.raises(DirectoryError, match=r"services\.toml: devices\.it: .*correct the keys"):
         made("Scanner", **config)
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"opening": 0.0}, "opening: expected a number above 0 and at most 0.1 (m), found 0.0"),
+        ({"opening": -1}, "opening: expected a number above 0 and at most 0.1 (m), found -1"),
+        ({"opening": 0.11}, "opening: expected a number above 0 and at most 0.1 (m), found 0.11"),
+        ({"opening": "0.05"}, "opening: expected a number above 0 and at most 0.1 (m), found"),
+        ({"tries": -1}, "tries: expected a whole number of at least 0, found -1"),
+        ({"side": "up"}, 'side: expected "left" or "right" (of the belt), found \'up\''),
+        ({"side": ["left"]}, 'side: expected "left" or "right" (of the belt), found [\'left\']'),
+    ],
+)
+def test_a_value_outside_the_limits_of_its_key_is_refused(
+    config: dict[str, Any], words: str
+) -> None:
+    class Gripper(Driver):
+        opening: float = key(0.1, "m", above=0, most=0.1)
+        tries: int = key(0, least=0)
+        side: str = key("left", "of the belt", choices=("left", "right"))
+        offset: float = key(None, least=0)
+
+    read = read_keys(Gripper, {"opening": 0.1, "tries": 0, "side": "right"})
+    assert read == {"opening": 0.1, "tries": 0, "side": "right", "offset": None}
+    with pytest.raises(ValueError, match="^" + re.escape(words)):
+        read_keys(Gripper, config)
+
+    class Wider(Gripper):
+        opening = 0.2
+
+    with pytest.raises(ValueError, match=r"opening: expected .*, found the default 0.2 of its"):
+        read_keys(Wider, {})
 
 
 def test_a_default_has_the_type_of_its_key() -> None:

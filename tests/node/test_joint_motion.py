@@ -287,10 +287,10 @@ def test_what_an_axis_refuses_leaves_it_where_it_is(body: dict[str, Any], words:
         ({"ends": [0.0]}, "ends: expected 2 finite numbers"),
         ({"ends": [0.0, 1.0]}, r"stations: high lies beyond the ends \[0.0, 1.0\] m"),
         ({"stations": {"low": "0.2"}}, "stations.low: expected 1 finite numbers, found"),
-        ({"top_speed": 0.0}, "top_speed: expected a number above 0, found 0"),
+        ({"top_speed": 0.0}, r"top_speed: expected a number above 0 \(m/s\), found 0.0"),
         (
             {"acceleration": -1},
-            "acceleration: expected a number above 0, found -1",
+            r"acceleration: expected a number above 0 \(m/s\^2\), found -1",
         ),
         ({"top_sped": 1.0}, "top_sped: .*top_speed"),
     ],

@@ -323,9 +323,9 @@ class Bridge(TopicDriver):
 
     url: str = key("ws://127.0.0.1:9090", "ws://, wss://, or module:Class of a simulation")
     heartbeat: float = key(
-        10.0, "s without a message until the server must answer a ping; 0: never"
+        10.0, "s without a message until the server must answer a ping; 0: never", least=0
     )
-    patience: float = key(5.0, "s without a word after a cancel until a goal is given up")
+    patience: float = key(5.0, "s without a word after a cancel until a goal is given up", above=0)
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)

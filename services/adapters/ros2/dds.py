@@ -102,7 +102,7 @@ def plain(sample: Any) -> Any:
 class Topics(TopicDriver):
     """Topics of a ROS 2 robot over DDS. Its actions are `wait_for`, `publish` and `drive`."""
 
-    domain: int = key(0, "ROS_DOMAIN_ID")
+    domain: int = key(0, "ROS_DOMAIN_ID", least=0, most=232)
     reliable: bool = key(True, "False: also messages of publishers that are not reliable (sensors)")
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:

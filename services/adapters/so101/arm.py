@@ -189,13 +189,13 @@ class Arm(Driver):
     calibration: str = key("", "file of the zero positions, written by the command calibrate")
     limits: dict[str, Any] = key({}, "joints with other limits, as { gripper = [0.0, 1.5] } (rad)")
     reverse: list[str] = key([], "joints whose servo turns the other way")
-    top_speed: float = key(1.5, "rad/s")
-    acceleration: float = key(6.0, "rad/s^2")
-    overload: float = key(0.9, "load from which a joint gives way, share of the stall torque")
-    squeeze: float = key(0.5, "greatest load of the gripper, share of the stall torque")
+    top_speed: float = key(1.5, "rad/s", above=0)
+    acceleration: float = key(6.0, "rad/s^2", above=0)
+    overload: float = key(0.9, "of the stall torque: a joint gives way", above=0, most=1)
+    squeeze: float = key(0.5, "of the stall torque: the gripper's greatest load", above=0, most=1)
     hottest: float = key(60.0, "deg C")
     enable: bool = key(True, "torque on at the start")
-    on_estop: str = key("hold", "hold or off: with torque off the arm falls")
+    on_estop: str = key("hold", "with torque off the arm falls", choices=("hold", "off"))
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         """Open the port. Raises ValueError for a wrong key or calibration file, ConnectionError if
@@ -234,11 +234,6 @@ class Arm(Driver):
             low, high = numbers(pair, 2, f"limits.{name}")
             if not -math.pi <= low < high <= math.pi:
                 raise ValueError(f"limits.{name}: expected [low, high] in rad, found {pair}")
-        for name in ("overload", "squeeze"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}: expected a number above 0, at most 1")
-        if self.on_estop not in ("hold", "off"):
-            raise ValueError(f'on_estop: expected "hold" or "off", found {self.on_estop!r}')
 
     def _read_calibration(self) -> bool:
         """Read the zero positions from the file. Return False if there is none yet."""

@@ -115,21 +115,16 @@ class Arm(Driver):
     period = 0.008
     obeys = ("speed", "workspace", "dry_run", "pause")
     host: str = key(text="IP address of the controller, or unix:PATH of a simulated one")
-    model: str = key("ur5e", "ur3e, ur5e or ur10e")
+    model: str = key("ur5e", choices=MODELS)
     tool: list[float] = key([0.0, 0.0, 0.0], "tool point in the flange's frame, m")
-    top_speed: float = key(1.05, "rad/s")
-    acceleration: float = key(1.4, "rad/s^2")
-    rtde_port: int = key(30004)
-    dashboard_port: int = key(29999)
-    program_port: int = key(30002)
+    top_speed: float = key(1.05, "rad/s", above=0, most=3.14)
+    acceleration: float = key(1.4, "rad/s^2", above=0, most=20)
+    rtde_port: int = key(30004, least=1, most=65535)
+    dashboard_port: int = key(29999, least=1, most=65535)
+    program_port: int = key(30002, least=1, most=65535)
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         super().__init__(config, ports)
-        if self.model not in MODELS:
-            known = ", ".join(MODELS)
-            raise ValueError(f"model: expected one of {known}, found {self.model!r}")
-        if self.top_speed > 3.14 or self.acceleration > 20.0:
-            raise ValueError("expected top_speed up to 3.14 rad/s, acceleration up to 20 rad/s^2")
         self._arm = chain(self.model, numbers(self.tool, 3, "tool"))
         addresses = self.rtde_port, self.dashboard_port, self.program_port
         self._link, self._dashboard, self._program = (

@@ -167,7 +167,7 @@ def test_a_command_outside_its_limits_is_refused(body: Any, words: str) -> None:
         ({"reverse": ["nose"]}, "no joint 'nose'"),
         ({"speed": 0.0}, "speed: expected a number above 0"),
         ({"overload": 1.5}, "overload: expected a number above 0"),
-        ({"acceleration": 0.0}, "expected a speed and acceleration above 0"),
+        ({"acceleration": 0.0}, "acceleration: expected a number above 0"),
         ({"on_estop": "fall"}, "on_estop"),
         ({"baud": 9600}, "baud: unknown key; known: port, "),
     ],
