@@ -35,7 +35,7 @@ class CameraDriver(Driver):
     """
 
     source: str = key(text='where images come from, such as "capture:0"')
-    rate: float = key(0.0, "images/s; 0: the usual rate of this camera", least=0)
+    rate: float = key(0.0, "images/s; 0: the usual rate of this camera", least=0, most=FASTEST)
     threads: int = key(1, "of OpenCV: other nodes share the cores")
 
     usual_rate = 25.0
@@ -61,10 +61,8 @@ class CameraDriver(Driver):
         cv2.setNumThreads(self.threads)
         self.rate = self.rate or self.usual_rate
         if not 0.0 < self.rate <= FASTEST:
-            raise CameraError(
-                f"rate: expected images/s above 0 and at most {FASTEST:g}, such as "
-                f"{self.usual_rate:g}, found {self.rate:g}"
-            )
+            text = f"expected images/s above 0 and at most {FASTEST:g}, found {self.rate:g}"
+            raise CameraError(f"usual_rate: {text}; set another one, or give the key `rate`")
 
     # For actions
 

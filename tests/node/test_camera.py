@@ -54,9 +54,15 @@ class Eye(CameraDriver):
     shaped_by = "[camera] of eye.toml"
 
 
-def eye(source: Source, **table: Any) -> Eye:
+class Silent(Eye):
+    """A camera that does not tell its rate."""
+
+    usual_rate = 0.0
+
+
+def eye(source: Source, kind: type[Eye] = Eye, **table: Any) -> Eye:
     ports = type("Own", (), {"images": lambda self: source, "now": 2.0})()
-    return Eye({"source": "sim", **table}, cast(Ports, ports))
+    return kind({"source": "sim", **table}, cast(Ports, ports))
 
 
 async def look(ctx: Context[CameraDriver], count: int = 2) -> Result:
@@ -156,8 +162,12 @@ def test_why_images_are_missing_is_said() -> None:
 
 @pytest.mark.parametrize("rate", [-1.0, 1001.0])
 def test_an_impossible_rate_is_refused(rate: float) -> None:
-    with pytest.raises(CameraError, match=r"rate: expected images/s .* such as 40, found"):
+    with pytest.raises(
+        ValueError, match=r"^rate: expected a number .* at most 1000"
+    ):
         eye(Source(), rate=rate)
+    with pytest.raises(CameraError, match="usual_rate: expected images/s above 0 and at most 1000"):
+        eye(Source(), Silent)
     assert eye(Source(), rate=12.5).rate == 12.5
 
 
