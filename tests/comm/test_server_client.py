@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import re
 import socket
 import threading
 import time
@@ -20,6 +21,7 @@ from petrobot.services.comm.protocol.messages import Answer, Executed, Outcome, 
 from petrobot.services.comm.protocol.security import KeyNeededError
 from tests import waiting
 from tests.comm.ends import Coordinator, Node, slow_line, until
+from tests.ports import free_ports
 
 
 async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:
@@ -88,6 +90,51 @@ async def test_names_that_nobody_resolves_delay_no_other_peer(
         answered.set()
         for one in (*absent, there):
             await one.client.close()
+
+
+def named(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> str:
+    """Return a host's name that stands for these addresses."""
+    known, name = socket.getaddrinfo, "robot.example"
+
+    def look_up(host: str, *rest: Any, **options: Any) -> list[Any]:
+        those = addresses if host == name else (host,)
+        return [found for one in those for found in known(one, *rest, **options)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    return name
+
+
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [("127.0.0.2", "connection refused"), ("255.255.255.255", r"[a-z ]+, connection refused")],
+)
+async def test_why_none_of_several_addresses_answers(
+    other: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (port,) = free_ports(1)
+    coordinator = Coordinator(named(monkeypatch, other, "127.0.0.1"), port)
+    await until(lambda: re.fullmatch(why, coordinator.client.trouble) is not None)
+    await coordinator.client.close()
+
+
+async def test_a_peer_is_reached_though_one_of_its_addresses_is_dead(
+    node: Node, key: bytes | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name with two addresses, as of a computer with a cable and a radio link: each attempt ended
+    while it waited for the first one, so the second was never tried."""
+    _, port = node.server.address
+    name = named(monkeypatch, "127.0.0.2", "127.0.0.1")
+    with contextlib.ExitStack() as dead:  # a full queue: the kernel drops what more comes
+        silent = dead.enter_context(socket.create_server(("127.0.0.2", port), backlog=0))
+        for _ in range(4):
+            waiting_one = dead.enter_context(socket.socket())
+            waiting_one.setblocking(False)
+            waiting_one.connect_ex(silent.getsockname())
+        coordinator = Coordinator(name, port, key=key)
+        try:
+            assert await coordinator.client.connected(10.0), coordinator.client.trouble
+        finally:
+            await coordinator.client.close()
 
 
 async def test_calls_of_several_clients_of_a_process_have_different_ids(open_node: Node) -> None:

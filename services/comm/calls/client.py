@@ -16,11 +16,14 @@ import logging
 import math
 import os
 import random
+import re
 import socket
 import ssl
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, cast
+
+from aiohappyeyeballs import AddrInfoType, start_connection
 
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.link import (
@@ -126,12 +129,6 @@ class _ClientLink(AsyncLink):
         self._client.gone(now, self)
 
 
-def _addresses(host: str) -> list[str]:
-    """Return the IP addresses of a name. Raises OSError."""
-    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-    return list(dict.fromkeys(str(address[0]) for *_, address in found))
-
-
 class Client:
     """Keeps a caller connected to its peer.
 
@@ -177,7 +174,7 @@ class Client:
         self._link: _ClientLink | None = None
         self._future = futures_of(self._loop)
         self._task: asyncio.Task[None] | None = None
-        self._lookup: asyncio.Future[list[str]] | None = None
+        self._lookup: asyncio.Future[list[AddrInfoType]] | None = None
         self._alarm = Alarm(self._advance)
         self._excused = False
         self._behind = -math.inf
@@ -341,14 +338,17 @@ class Client:
         self._link = link
         return link
 
-    async def _look_up(self) -> list[str]:
-        """Return the IP addresses of the peer's host. A lookup that takes longer than an attempt
-        serves the next one."""
+    async def _look_up(self) -> list[AddrInfoType]:
+        """Return the addresses of the peer. A lookup that takes longer than an attempt serves the
+        next one."""
+        look_up: Callable[[], Any] = partial(
+            socket.getaddrinfo, self.host, self.port, type=socket.SOCK_STREAM
+        )
         with contextlib.suppress(ValueError):
             ipaddress.ip_address(self.host)
-            return [self.host]
+            return cast("list[AddrInfoType]", look_up())
         if self._lookup is None:
-            self._lookup = in_thread(partial(_addresses, self.host))
+            self._lookup = in_thread(look_up)
         try:
             return await asyncio.shield(self._lookup)
         finally:
@@ -356,16 +356,12 @@ class Client:
                 self._lookup = None
 
     async def _reach(self) -> _ClientLink:
-        *others, last = await self._look_up()
-        for address in others:
-            with contextlib.suppress(OSError):
-                return await self._reach_at(address)
-        return await self._reach_at(last)
-
-    async def _reach_at(self, address: str) -> _ClientLink:
+        # Several addresses in turn would not do: the attempt ends while the first one is silent.
+        addresses, next_one = await self._look_up(), self.timing.silence / 4
+        found = await start_connection(addresses, happy_eyeballs_delay=next_one)
         name = self.caller.peer if self.tls is not None else None
         _, link = await self._loop.create_connection(
-            lambda: _ClientLink(self), address, self.port, ssl=self.tls, server_hostname=name
+            lambda: _ClientLink(self), sock=found, ssl=self.tls, server_hostname=name
         )
         return link
 
@@ -424,12 +420,10 @@ class Client:
             clock = "; set the clock of this computer" if early else ""
             return f"expected the certificate of {self.caller.peer}: {fault.verify_message}{clock}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
-        if (
-            isinstance(fault, OSError)
-            and fault.errno
-            and not isinstance(fault, ssl.SSLError | socket.gaierror)
-        ):
-            said = os.strerror(fault.errno).lower()  # asyncio's text only repeats the address
+        if not isinstance(fault, ssl.SSLError | socket.gaierror):
+            # asyncio's text only repeats the address; several addresses may fail in several ways
+            found = dict.fromkeys(re.findall(r"\[Errno (\d+)\]", str(fault)))
+            said = ", ".join(os.strerror(int(number)).lower() for number in found) or said
         return (
             f"{said}; {NOT_TRUSTED}"
             if self.tls is not None

@@ -218,6 +218,8 @@ def handshake(
 
 
 _CHUNK: Final = 1 << 18
+_SILENT: Final = 1.0
+"""Time in which an address must answer before the host's next one is tried (s)."""
 _RETRY: Final = 0.02
 """Pause between attempts to reach a member that does not listen yet (s)."""
 _LINGER: Final = 1.0
@@ -354,7 +356,7 @@ class Member:
         while True:
             try:
                 sock = socket.create_connection(
-                    (host, port), timeout=max(deadline - time.monotonic(), _RETRY)
+                    (host, port), timeout=min(_SILENT, max(deadline - time.monotonic(), _RETRY))
                 )
                 break
             except OSError as fault:
