@@ -1,4 +1,4 @@
-"""`python -m petrobot.coordinator` is the `petrobot` command."""
+"""`python -m petrobot.coordinator` is `python -m petrobot`."""
 
 import sys
 

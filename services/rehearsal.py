@@ -110,7 +110,7 @@ def rehearse_task(task: str | Path, /, *options: str) -> dict[str, Any]:
 
 
 def _command(*arguments: str, ends: Collection[int]) -> str:
-    command = [sys.executable, "-m", "petrobot.coordinator", *arguments]
+    command = [sys.executable, "-m", "petrobot", *arguments]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode not in ends:
         raise AssertionError(f"petrobot {arguments[0]}:\n{done.stdout}{done.stderr}")

@@ -21,7 +21,7 @@ LEFT, TOP, WIDTH, HEIGHT = 60, 20, 480, 240
 
 def measured(runs: int, folder: Path) -> dict[int, tuple[int, int]]:
     """Return for each n how many runs there were, and how many met the specification."""
-    command = [sys.executable, "-m", "petrobot.coordinator", "campaign", str(HERE / "locate.toml")]
+    command = [sys.executable, "-m", "petrobot", "campaign", str(HERE / "locate.toml")]
     command += ["--runs", str(runs), "--selector", "round_robin", "--out", str(folder), "--quiet"]
     subprocess.run(command, check=True)
     found: dict[int, tuple[int, int]] = {}

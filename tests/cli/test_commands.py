@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 def petrobot(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
-    command = [sys.executable, "-m", "petrobot.coordinator", *arguments]
+    command = [sys.executable, "-m", "petrobot", *arguments]
     return subprocess.run(
         command, cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
