@@ -9,6 +9,7 @@ import getpass
 import os
 import re
 import signal
+import socket
 import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -26,6 +27,7 @@ from petrobot.coordinator.cli.loading import (
 )
 from petrobot.coordinator.cli.options import add_log_level_argument, refuse_idle
 from petrobot.coordinator.run.folder import NODE_LOGS
+from petrobot.services.comm.protocol.security import is_loopback
 from petrobot.services.host.command_line import done_before, number
 
 if TYPE_CHECKING:
@@ -157,10 +159,24 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
         for name, process in supervisor.process_ids().items():
             node = directory.nodes[name]
             print(f"{name:12} ready on {node.host}:{node.port} (process {process})", flush=True)
+            if note := only_here(node.host):
+                print(f"{'':12} {note}", flush=True)
         print("Ctrl-C stops them all", flush=True)
         # Members of a lock-step cell end by themselves.
         await done_before(stop, supervisor.ended() if options.lockstep else stop.wait())
     return 0
+
+
+def only_here(host: str) -> str:
+    """Return a note if a name that is meant for other hosts stands for an address that only this
+    one reaches, as Debian gives a host's own name; else empty."""
+    if is_loopback(host):
+        return ""
+    *_, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+    if not is_loopback(str(address[0])):
+        return ""
+    text = f"other hosts cannot reach it: {host} stands for {address[0]} here; write the address"
+    return f"{text} of this host into services.toml, or correct /etc/hosts"
 
 
 # --- one node, or the laboratory ---

@@ -1,9 +1,10 @@
-"""`petrobot up --print-unit`: a systemd unit for the nodes of this host."""
+"""`petrobot up`: its systemd unit for the nodes of this host, and what it says of their address."""
 
 from __future__ import annotations
 
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 from configparser import RawConfigParser
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.up import only_here
 
 SERVICES = 'schema = 1\n[nodes.left]\nhost = "127.0.0.1"\nport = 4901\n'
 
@@ -49,3 +51,23 @@ def test_systemd_accepts_the_unit(cell: Path, capsys: pytest.CaptureFixture[str]
     command = ["systemd-analyze", "verify", "--man=no", str(unit)]
     said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert not [line for line in said.stderr.splitlines() if "petrobot.service" in line], said
+
+
+@pytest.mark.parametrize(
+    ("host", "address", "said"),
+    [
+        ("robot", "127.0.1.1", "other hosts cannot reach it: robot stands for 127.0.1.1 here; "),
+        ("robot", "192.0.2.7", ""),
+        ("localhost", "127.0.0.1", ""),
+        ("127.0.1.1", "127.0.1.1", ""),
+    ],
+)
+def test_a_name_that_only_this_host_knows_as_loopback(
+    host: str, address: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Debian and Ubuntu write 127.0.1.1 and the host's own name into /etc/hosts."""
+    known = socket.getaddrinfo
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda name, *rest, **more: known(address, *rest, **more)
+    )
+    assert only_here(host).startswith(said) and bool(only_here(host)) is bool(said)
