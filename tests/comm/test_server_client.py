@@ -10,11 +10,13 @@ import socket
 import threading
 import time
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from petrobot.services.comm.calls.caller import Notice, Patience, PeerLost
+from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Answer, Executed, Outcome, Welcome
@@ -104,6 +106,35 @@ def named(monkeypatch: pytest.MonkeyPatch, *addresses: str) -> str:
     return name
 
 
+async def complains(client: Client, why: str) -> None:
+    """Wait until a client says why it has no connection."""
+    await until(lambda: re.match(why, client.trouble) is not None)
+
+
+@contextlib.contextmanager
+def dead_address(port: int) -> Iterator[None]:
+    """Let 127.0.0.2 answer nothing at a port: its queue is full, so the kernel drops what comes."""
+    with contextlib.ExitStack() as held:
+        silent = held.enter_context(socket.create_server(("127.0.0.2", port), backlog=0))
+        for _ in range(4):
+            one = held.enter_context(socket.socket())
+            one.setblocking(False)
+            one.connect_ex(silent.getsockname())
+        yield
+
+
+async def test_a_host_that_answers_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    (port,) = free_ports(1)
+    with dead_address(port):
+        for host, why in (
+            (named(monkeypatch, "127.0.0.2"), f"no answer: .* its firewall let TCP port {port} "),
+            ("127.0.0.2", "no answer$"),
+        ):
+            client = Coordinator(host, port).client
+            await complains(client, why)
+            await client.close()
+
+
 @pytest.mark.parametrize(
     ("other", "why"),
     [("127.0.0.2", "connection refused"), ("255.255.255.255", r"[a-z ]+, connection refused")],
@@ -113,7 +144,7 @@ async def test_why_none_of_several_addresses_answers(
 ) -> None:
     (port,) = free_ports(1)
     coordinator = Coordinator(named(monkeypatch, other, "127.0.0.1"), port)
-    await until(lambda: re.fullmatch(why, coordinator.client.trouble) is not None)
+    await complains(coordinator.client, f"{why}$")
     await coordinator.client.close()
 
 
@@ -124,15 +155,10 @@ async def test_a_peer_is_reached_though_one_of_its_addresses_is_dead(
     while it waited for the first one, so the second was never tried."""
     _, port = node.server.address
     name = named(monkeypatch, "127.0.0.2", "127.0.0.1")
-    with contextlib.ExitStack() as dead:  # a full queue: the kernel drops what more comes
-        silent = dead.enter_context(socket.create_server(("127.0.0.2", port), backlog=0))
-        for _ in range(4):
-            waiting_one = dead.enter_context(socket.socket())
-            waiting_one.setblocking(False)
-            waiting_one.connect_ex(silent.getsockname())
+    with dead_address(port):
         coordinator = Coordinator(name, port, key=key)
         try:
-            assert await coordinator.client.connected(10.0), coordinator.client.trouble
+            assert await coordinator.client.connected(10.0)
         finally:
             await coordinator.client.close()
 

@@ -45,7 +45,7 @@ from petrobot.services.comm.protocol.messages import (
     Refuse,
     Welcome,
 )
-from petrobot.services.comm.protocol.security import UNPROVEN, Keys
+from petrobot.services.comm.protocol.security import UNPROVEN, Keys, is_loopback
 from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
 from petrobot.services.comm.tls.credentials import EXPIRED, NOT_YET_VALID
 
@@ -409,6 +409,12 @@ class Client:
             self.caller.link_down(now, link.reason, final=link.silent)
         self.flush(now)
 
+    def _silence(self) -> str:
+        """Return why nothing may answer at all."""
+        if is_loopback(self.host):
+            return "no answer"
+        return f"no answer: is the host on, and does its firewall let TCP port {self.port} pass?"
+
     def _said(self, fault: Exception) -> str:
         """Return why there is no connection, in words."""
         if isinstance(fault, ssl.SSLCertVerificationError):
@@ -419,7 +425,7 @@ class Client:
             early = fault.verify_code == NOT_YET_VALID
             clock = "; set the clock of this computer" if early else ""
             return f"expected the certificate of {self.caller.peer}: {fault.verify_message}{clock}"
-        said = str(getattr(fault, "strerror", "") or fault) or "no answer"
+        said = str(getattr(fault, "strerror", "") or fault) or self._silence()
         if not isinstance(fault, ssl.SSLError | socket.gaierror):
             # asyncio's text only repeats the address; several addresses may fail in several ways
             found = dict.fromkeys(re.findall(r"\[Errno (\d+)\]", str(fault)))
