@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import getpass
+import ipaddress
 import os
 import re
 import signal
@@ -168,15 +169,18 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
 
 
 def only_here(host: str) -> str:
-    """Return a note if a name that is meant for other hosts stands for an address that only this
-    one reaches, as Debian gives a host's own name; else empty."""
+    """Return a note if an address that is meant for other hosts leads each of them to itself: a
+    host's own name in Debian's /etc/hosts, or 0.0.0.0; else empty."""
     if is_loopback(host):
         return ""
-    *_, address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
-    if not is_loopback(str(address[0])):
+    *_, found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+    address = ipaddress.ip_address(str(found[0]).partition("%")[0])
+    if not (address.is_loopback or address.is_unspecified):
         return ""
-    text = f"other hosts cannot reach it: {host} stands for {address[0]} here; write the address"
-    return f"{text} of this host into services.toml, or correct /etc/hosts"
+    own = f"{host} stands for {address} here"
+    why = own if address.is_loopback else f"{host} is not the address of one host"
+    text = f"other hosts cannot reach it: {why}; write the address of this host into services.toml"
+    return f"{text}, or correct /etc/hosts" if address.is_loopback else text
 
 
 # --- one node, or the laboratory ---

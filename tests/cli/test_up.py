@@ -57,7 +57,9 @@ def test_systemd_accepts_the_unit(cell: Path, capsys: pytest.CaptureFixture[str]
     ("host", "address", "said"),
     [
         ("robot", "127.0.1.1", "other hosts cannot reach it: robot stands for 127.0.1.1 here; "),
+        ("0.0.0.0", "0.0.0.0", "other hosts cannot reach it: 0.0.0.0 is not the address of one"),
         ("robot", "192.0.2.7", ""),
+        ("robot", "fe80::7", ""),
         ("localhost", "127.0.0.1", ""),
         ("127.0.1.1", "127.0.1.1", ""),
     ],
