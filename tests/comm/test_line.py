@@ -12,7 +12,13 @@ import pytest
 
 from petrobot import ByteLine, Link
 from petrobot.services.comm.streams import line as lines
-from petrobot.services.comm.streams.line import BACKLOG, PAUSES, TcpConnection, unix_socket
+from petrobot.services.comm.streams.line import (
+    BACKLOG,
+    PAUSES,
+    SerialPort,
+    TcpConnection,
+    unix_socket,
+)
 from tests.waiting import Limit
 
 
@@ -229,3 +235,31 @@ def test_a_silent_line_is_given_up() -> None:
         and opening.lines[0].closed
     )
     link.close()
+
+
+@pytest.mark.parametrize(
+    ("there", "others"),
+    [
+        ({"serial/by-id/*": ["usb-1a86"], "tty[AU][CS][BM]*": ["ttyUSB0"]}, "usb-1a86"),
+        ({"tty[AU][CS][BM]*": ["ttyUSB1", "ttyACM0"]}, "ttyACM0, ttyUSB1"),
+        ({}, "no serial adapter"),
+    ],
+)
+def test_a_serial_port_that_is_not_there(
+    there: dict[str, list[str]], others: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "glob", lambda path, pattern: there.get(pattern, []))
+    with pytest.raises(ConnectionError, match=rf"no such file: is it .* This host has {others}$"):
+        SerialPort(str(tmp_path / "ttyUSB0"), 9600)
+
+
+def test_a_serial_port_that_this_user_may_not_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = tmp_path / "ttyUSB0"
+    port.touch()
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(
+        ConnectionError, match=f"may not open it; `sudo usermod -aG {port.group()} "
+    ):
+        SerialPort(str(port), 9600)

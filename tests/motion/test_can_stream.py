@@ -3,6 +3,8 @@ the hub, and bad input."""
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
 import struct
 from collections.abc import Iterator
@@ -300,6 +302,40 @@ def test_any_python_can_interface_is_a_can_bus() -> None:
         other.send(can.Message(arbitration_id=0x1ABCDEF, is_extended_id=True))
         other.send(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\x07"))
         assert list(port.receive()) == [Frame(0x181, b"\x07")]
+    port.close()
+
+
+class Unplugged(can.BusABC):
+    """A bus whose interface has been brought down."""
+
+    def __init__(self) -> None:
+        super().__init__("can0")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+
+    def _recv_internal(self, timeout: float | None) -> Any:
+        raise can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN)
+
+
+def test_a_bus_that_is_not_there_or_not_up_says_what_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(**settings: Any) -> can.BusABC:
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+    table = {"interface": "socketcan", "channel": "can0"}
+    monkeypatch.setattr(can, "Bus", absent)
+    with pytest.raises(ConnectionError, match=r"^no CAN bus socketcan can0: .*; is its adapter"):
+        open_can(table)
+    monkeypatch.setattr(can, "Bus", lambda **settings: Unplugged())
+    port = open_can(table)
+    with pytest.raises(
+        ConnectionError, match=r"is gone: .* is down .*; bring it up, as by `sudo ip"
+    ):
+        port.receive()
+    with pytest.raises(
+        ConnectionError, match=r"frames: .* is down .*; bring it up, as by `sudo ip"
+    ):
+        port.send(Frame(0x80, b""))
     port.close()
 
 

@@ -3,6 +3,7 @@ interface."""
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -50,7 +51,8 @@ class PythonCanBus(CanBus):
                 can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
             )
         except (can.CanError, OSError) as reason:
-            raise ConnectionError(f"the CAN bus does not accept frames: {reason}") from reason
+            text = f"the CAN bus does not accept frames: {_said(reason)}"
+            raise ConnectionError(text) from reason
 
     def receive(self) -> Sequence[Frame]:
         """Return the standard data frames that have arrived."""
@@ -62,12 +64,24 @@ class PythonCanBus(CanBus):
                 ):
                     frames.append(Frame(message.arbitration_id, bytes(message.data)))
         except (can.CanError, OSError) as reason:
-            raise ConnectionError(f"the CAN bus is gone: {reason}") from reason
+            raise ConnectionError(f"the CAN bus is gone: {_said(reason)}") from reason
         return frames
 
     def close(self) -> None:
         """Leave the bus."""
         self._bus.shutdown()
+
+
+_REMEDIES = {
+    errno.ENODEV: "is its adapter plugged in? `ip link` shows the interfaces of this host",
+    errno.ENETDOWN: "bring it up, as by `sudo ip link set can0 up type can bitrate 1000000`",
+}
+"""By error number: what helps with a bus of Linux (docs/deploy.md)."""
+
+
+def _said(reason: Exception) -> str:
+    number = getattr(reason, "errno", None) or getattr(reason, "error_code", None)
+    return f"{reason}; {_REMEDIES[number]}" if number in _REMEDIES else str(reason)
 
 
 def open_can(config: Mapping[str, Any]) -> CanBus:
@@ -89,5 +103,5 @@ def open_can(config: Mapping[str, Any]) -> CanBus:
         return PythonCanBus(can.Bus(**settings))
     except (can.CanError, OSError) as reason:
         raise ConnectionError(
-            f"no CAN bus {settings['interface']} {settings['channel']}: {reason}"
+            f"no CAN bus {settings['interface']} {settings['channel']}: {_said(reason)}"
         ) from reason

@@ -10,6 +10,7 @@ import select
 import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final, Protocol
 
 BACKLOG: Final = 65536
@@ -52,7 +53,8 @@ class SerialPort(ByteLine):
         try:
             self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as fault:
-            raise ConnectionError(f"serial port {path} at {baud} baud: {fault}") from fault
+            why = _obstacle(Path(path)) or fault
+            raise ConnectionError(f"serial port {path} at {baud} baud: {why}") from fault
         self._waiting = b""
 
     def send(self, data: bytes) -> None:
@@ -88,6 +90,25 @@ class SerialPort(ByteLine):
     def close(self) -> None:
         """Release the port."""
         self._port.close()
+
+
+ADAPTERS: Final = ("serial/by-id/*", "tty[AU][CS][BM]*")
+"""Files of serial adapters in /dev: names that stay the same, and numbered ones."""
+
+
+def _obstacle(path: Path) -> str:
+    """Return why a serial port of this host may not be opened, and what helps; empty if it may."""
+    if not path.exists():
+        found = next(filter(None, (sorted(Path("/dev").glob(kind)) for kind in ADAPTERS)), [])
+        others = ", ".join(map(str, found)) or "no serial adapter"
+        return f"there is no such file: is it plugged in? This host has {others}"
+    if not os.access(path, os.R_OK | os.W_OK):
+        try:
+            group = path.group()
+        except KeyError:  # a group without a name
+            group = str(path.stat().st_gid)
+        return f"this user may not open it; `sudo usermod -aG {group} USER`, and log in again"
+    return ""
 
 
 class TcpConnection(ByteLine):
