@@ -93,7 +93,8 @@ lead = {{ run = "toy_cell.actions:lead", task = "see", device = "eye" }}
 eye_pid = {{ run = "toy_cell.actions:pid", task = "see", device = "eye" }}
 hang_eye = {{ run = "toy_cell.actions:hang", task = "see", device = "eye", deadline = 1.0 }}
 add = {{ run = "toy_cell.actions:add", task = "sum", node = "left" }}
-nap = {{ run = "toy_cell.actions:nap", task = "sum", node = "left", orphan_time = 0.2 }}
+nap = {{ run = "toy_cell.actions:nap", task = "sum", node = "left" }}
+doze = {{ run = "toy_cell.actions:nap", task = "sum", node = "left", orphan_time = 0.2 }}
 relay = {{ run = "toy_cell.actions:relay", task = "sum", node = "left" }}
 swap_left = {{ run = "toy_cell.actions:swap", task = "sum", node = "left" }}
 swap_right = {{ run = "toy_cell.actions:swap", task = "sum", node = "right" }}
@@ -480,7 +481,7 @@ async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> N
     )
     client.start()
     assert await client.connected(PATIENCE)
-    client.caller.call(client.now(), Call("orphan", "nap", {"seconds": 60.0}))
+    client.caller.call(client.now(), Call("orphan", "doze", {"seconds": 60.0}))
     client.flush()
     await other.heard(Accept)
     await client.close()
