@@ -64,8 +64,8 @@ async def until_moving(folder: Path) -> None:
 def judged(mission: Mission) -> tuple[list[RunRecorded], list[RunRecorded]]:
     """Return the runs of a mission run with a status, and those without one. On a busy host the
     bell may preempt a run before its node has answered the call; such a run has not begun
-    (docs/semantics.md, records)."""
-    runs = mission.tally.runs
+    (docs/semantics.md, records). And a node may be silent for so long that its runs are lost."""
+    runs = [r for r in mission.tally.runs if not (r.cause == "lost" and "silent for" in r.text)]
     return [r for r in runs if r.status is not None], [r for r in runs if r.status is None]
 
 

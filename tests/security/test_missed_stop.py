@@ -137,7 +137,10 @@ class Turns:
         logs = [self.folder / "logs" / f"{name}.log" for name in starts]
         ready = [log.read_text().count("ready on") for log in logs]
         await until(
-            lambda: [log.read_text().count("ready on") for log in logs] > ready,
+            lambda: all(
+                log.read_text().count("ready on") > before
+                for log, before in zip(logs, ready, strict=True)
+            ),
             "both nodes to be ready again",
         )
 
