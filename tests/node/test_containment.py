@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.comm.calls.caller import PeerLost
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.protocol.messages import Call, Feedback, Outcome
 from petrobot.services.node.child import Child
 from petrobot.services.worker.pipe import Item
@@ -307,17 +308,18 @@ async def test_messages_sent_before_a_process_ended_are_read(
     ids=["progress", "events"],
 )
 async def test_a_run_that_reports_without_end_disturbs_no_other(
-    operator: Operator, what: str, ends: set[str]
+    nodes: Nodes, what: str, ends: set[str]
 ) -> None:
     """Events that are stored as fast as they come let it run to its deadline."""
-    chatting = asyncio.create_task(operator.call("chatter", 2.0, what=what))
-    others = []
-    limit = Limit("the run to end at its deadline")
-    while not chatting.done() and limit.left():
-        others.append(await operator.call("nap", 20.0, seconds=0.05))
-    assert (await chatting).cause in ends
-    assert others and {run.status for run in others} == {"success"}
-    assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
+    async with operator_of(nodes.directory, "left", timing=LinkTiming()) as operator:
+        chatting = asyncio.create_task(operator.call("chatter", 2.0, what=what))
+        others = []
+        limit = Limit("the run to end at its deadline")
+        while not chatting.done() and limit.left():
+            others.append(await operator.call("nap", 20.0, seconds=0.05))
+        assert (await chatting).cause in ends
+        assert others and {run.status for run in others} == {"success"}
+        assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
 
 
 async def test_a_run_beyond_the_limit_is_refused_with_the_reason(

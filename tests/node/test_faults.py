@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.comm.calls.caller import PeerLost
+from petrobot.services.comm.calls.link import LinkTiming
 from tests.node.test_processes import Nodes, Operator, operator_of, pids
 from tests.processes import kill
 
@@ -37,7 +38,7 @@ async def test_a_device_stops_when_the_sender_of_its_stream_is_lost(
 ) -> None:
     running = Nodes(tmp_path, "left", "right")
     try:
-        async with operator_of(running.directory, "left", "right") as operator:
+        async with operator_of(running.directory, "left", "right", timing=LinkTiming()) as operator:
             victims = [(await pids(operator, "right", "eye"))["actions"]]
             if whom == "node":
                 victims.insert(0, running.processes["right"].pid)

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.protocol.messages import Command, Ping
 from petrobot.services.host.emergency_latch import ALL, Latch, latch_of
 from petrobot.services.node.emergency_stops import AGAIN, GUARD_LOOK, SILENCE, Guard
@@ -109,7 +110,7 @@ def moved(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Moved]:
 async def operator(moved: Moved) -> AsyncIterator[Operator]:
     for file in moved.files.values():
         file.unlink(missing_ok=True)
-    async with operator_of(moved.node.directory, "only") as one:
+    async with operator_of(moved.node.directory, "only", timing=LinkTiming()) as one:
         yield one
 
 

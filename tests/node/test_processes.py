@@ -19,6 +19,7 @@ import pytest
 
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.comm.lockstep.mesh import Member
 from petrobot.services.comm.protocol.messages import (
@@ -107,11 +108,17 @@ tell = {{ run = "toy_cell.actions:tell", task = "sum", node = "left" }}
 """
 
 
+PATIENT = LinkTiming(silence=10.0)
+"""Of connections in tests about something else than a node that is silent, as any node may be on a
+busy host."""
+
+
 class Operator:
     """Clients of all nodes, with the role of a coordinator."""
 
-    def __init__(self, directory: Directory) -> None:
+    def __init__(self, directory: Directory, timing: LinkTiming = PATIENT) -> None:
         self.directory = directory
+        self.timing = timing
         self.clients: dict[str, Client] = {}
         self.notices: list[Notice] = []
         self.changed = asyncio.Event()
@@ -125,7 +132,9 @@ class Operator:
             )
             caller = Caller(node, hello, auto_ack=True)
             host, port = self.directory.address(node)
-            self.clients[node] = Client(host, port, caller, on_notices=self._take)
+            self.clients[node] = Client(
+                host, port, caller, on_notices=self._take, timing=self.timing
+            )
             self.clients[node].start()
             assert await self.clients[node].connected(PATIENCE)
 
@@ -237,8 +246,10 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
 
 
 @asynccontextmanager
-async def operator_of(directory: Directory, *names: str) -> AsyncIterator[Operator]:
-    operator = Operator(directory)
+async def operator_of(
+    directory: Directory, *names: str, timing: LinkTiming = PATIENT
+) -> AsyncIterator[Operator]:
+    operator = Operator(directory, timing)
     await operator.connect(*names)
     try:
         yield operator

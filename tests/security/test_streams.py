@@ -41,7 +41,13 @@ class GuardedOperator(Operator):
             )
             caller, (host, port) = Caller(node, hello, auto_ack=True), self.directory.address(node)
             client = Client(
-                host, port, caller, on_notices=self._take, key=proves.key, tls=proves.client()
+                host,
+                port,
+                caller,
+                on_notices=self._take,
+                key=proves.key,
+                tls=proves.client(),
+                timing=self.timing,
             )
             self.clients[node] = client
             client.start()
