@@ -352,7 +352,7 @@ async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns
             # On a busy host the test was silent for so long that the controls are free.
             assert (await give(address, "take_controls"))["ok"]
             answer = await give(address, "start", task="turns")
-        await turns.moving()
+        await until(lambda: turns.begun() > then, "hands that move in the only turn")
     finally:
         page.kill()
         page.communicate()
