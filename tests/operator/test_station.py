@@ -21,7 +21,7 @@ from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from tests.operator.conftest import TASK, Cell
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S, Limit, until
 
 pytestmark = pytest.mark.processes
 
