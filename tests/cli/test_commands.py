@@ -8,6 +8,7 @@ import json
 import os
 import re
 import resource
+import runpy
 import socket
 import struct
 import subprocess
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+import petrobot as petrobot_package
 from petrobot.coordinator.analysis import commands, may_run
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
@@ -831,3 +833,12 @@ def test_over_ssh_the_page_comes_with_the_command_for_its_tunnel(
     page, *more = page_line("http://127.0.0.1:8377/?token=x").splitlines()
     assert page == "page: http://127.0.0.1:8377/?token=x"
     assert tunnel in "".join(more) and bool(more) is bool(tunnel)
+
+
+@pytest.mark.parametrize("system", ["darwin", "win32"])
+def test_another_operating_system_is_named(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wheel installs everywhere; the first missing module said nothing to its user."""
+    assert petrobot_package.__file__ is not None
+    monkeypatch.setattr(sys, "platform", system)
+    with pytest.raises(ImportError, match="^petrobot needs Linux, "):
+        runpy.run_path(petrobot_package.__file__)
