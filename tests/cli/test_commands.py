@@ -840,5 +840,5 @@ def test_another_operating_system_is_named(system: str, monkeypatch: pytest.Monk
     """The wheel installs everywhere; the first missing module said nothing to its user."""
     assert petrobot_package.__file__ is not None
     monkeypatch.setattr(sys, "platform", system)
-    with pytest.raises(ImportError, match="^petrobot needs Linux, "):
+    with pytest.raises(ImportError, match=r"^petrobot needs Linux, "):
         runpy.run_path(petrobot_package.__file__)
