@@ -8,6 +8,7 @@ import secrets
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -310,8 +311,11 @@ def local_programs(
 
     In lock step they wait `awaited` seconds (wall time) for a coordinator that died.
     """
+    hosts = list({node.host for node in directory.nodes.values()})
+    with ThreadPoolExecutor(32) as lookups:  # all at once: a name server may not answer
+        here = {host for host, local in zip(hosts, lookups.map(is_local, hosts)) if local}
     local = sorted(
-        (n for n in directory.nodes.values() if is_local(n.host)), key=lambda node: not node.sim
+        (n for n in directory.nodes.values() if n.host in here), key=lambda node: not node.sim
     )
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
