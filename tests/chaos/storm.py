@@ -51,7 +51,8 @@ KILLS = 4
 """Most kills of the coordinator of one mission run, so that the run can end."""
 UNREACHABLE, HANGS = 3, 1000
 PATIENCE = 60.0
-"""Seconds within which nodes must notice that all clients have disconnected."""
+"""Seconds within which nodes must notice that all clients have disconnected, and processes must
+end."""
 
 
 class FaultSchedule:
@@ -198,6 +199,9 @@ class Storm:
         finally:
             proxy.stdin.close()
             await proxy.wait()
+        end = loop.time() + PATIENCE
+        while _marked() and loop.time() < end:
+            await beat(0.1)
         return self._told(weather, left)
 
     def _hardly(self, weather: FaultSchedule) -> bool:

@@ -85,7 +85,7 @@ out = ["{first}"]
 """
 ACTION = """\
 [primitive_tasks.{name}]
-deadline = 20.0
+deadline = 60.0
 [places.{name}]
 kind = "action"
 [transitions.{name}_done]

@@ -86,7 +86,7 @@ def test_a_run_whose_journal_is_taken_away_ends_and_resumes_when_it_is_back(tmp_
     shuttle_services(tmp_path, fetch=0.2, carry=0.2, orphan=60.0)
     runs = tmp_path / "runs"
     given = ["--services", str(tmp_path / "services.toml"), "--journal", str(runs), *QUIET]
-    command = [sys.executable, "-m", "petrobot.coordinator", "run", str(TASK), "--runs", "8"]
+    command = [sys.executable, "-m", "petrobot.coordinator", "run", str(TASK), "--runs", "24"]
     up = nodes(tmp_path)
     try:
         with subprocess.Popen(

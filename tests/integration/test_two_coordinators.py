@@ -12,6 +12,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine import RunRecorded
@@ -31,8 +32,11 @@ LIMIT = 120.0
 
 
 def mission_on(directory: Directory, runs: int) -> Mission:
-    """Return a mission run that has not begun."""
+    """Return a mission run that has not begun. Its deadlines are long: on a busy host a move may be
+    late."""
     task = load_task(str(TASK))
+    patient = {name: replace(one, deadline=LIMIT) for name, one in task.primitive_tasks.items()}
+    task = replace(task, primitive_tasks=patient)
     return realtime_mission(directory, Setting(task, runs=runs), mission_id(task))
 
 
@@ -60,16 +64,16 @@ async def until_moving(folder: Path) -> None:
 def judged(mission: Mission) -> tuple[list[RunRecorded], list[RunRecorded]]:
     """Return the runs of a mission run with a status, and those without one. On a busy host the
     bell may preempt a run before its node has answered the call; such a run has not begun
-    (docs/semantics.md, records)."""
-    runs = mission.tally.runs
+    (docs/semantics.md, records). And a node may be silent for so long that its runs are lost."""
+    runs = [r for r in mission.tally.runs if not (r.cause == "lost" and "silent for" in r.text)]
     return [r for r in runs if r.status is not None], [r for r in runs if r.status is None]
 
 
 async def test_the_second_coordinator_is_refused_until_the_first_has_ended(tmp_path: Path) -> None:
     """No device is shared, no run of the first one is affected, and the next coordinator gets the
     hands at once."""
-    directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8))
-    first, second, third = (mission_on(directory, runs) for runs in (10, 2, 2))
+    directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8, orphan=LIMIT))
+    first, second, third = (mission_on(directory, runs) for runs in (20, 2, 2))
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
         leading = asyncio.create_task(led(directory, first))
         await until_moving(tmp_path)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.comm.calls.caller import PeerLost
+from petrobot.services.comm.calls.link import LinkTiming
 from tests.node.test_processes import Nodes, Operator, operator_of, pids
 from tests.processes import kill
 
@@ -37,7 +38,7 @@ async def test_a_device_stops_when_the_sender_of_its_stream_is_lost(
 ) -> None:
     running = Nodes(tmp_path, "left", "right")
     try:
-        async with operator_of(running.directory, "left", "right") as operator:
+        async with operator_of(running.directory, "left", "right", timing=LinkTiming()) as operator:
             victims = [(await pids(operator, "right", "eye"))["actions"]]
             if whom == "node":
                 victims.insert(0, running.processes["right"].pid)
@@ -47,9 +48,10 @@ async def test_a_device_stops_when_the_sender_of_its_stream_is_lost(
             leading = asyncio.create_task(operator.call("lead", seconds=60.0, speed=1000.0))
             await operator.until(lambda: _counted(operator, 10))
             kill(victims, how)
-            await operator.until(lambda: _older(operator, 4 * PERIOD))
+            then = (await slide(operator))["cycles"]  # it has not read the last set point yet
+            await operator.until(lambda: _older(operator, 4 * PERIOD, then + 4))
             stood = await slide(operator)
-            await operator.until(lambda: _older(operator, 20 * PERIOD))
+            await operator.until(lambda: _older(operator, 20 * PERIOD, then + 20))
             later = await slide(operator)
             assert later["position"] == stood["position"] and later["count"] == stood["count"]
             assert later["cycles"] > stood["cycles"], "its own process goes on, and holds"
@@ -69,5 +71,6 @@ async def _counted(operator: Operator, least: int) -> bool:
     return bool((await slide(operator))["count"] >= least)
 
 
-async def _older(operator: Operator, seconds: float) -> bool:
-    return bool((await slide(operator))["age"] >= seconds)
+async def _older(operator: Operator, seconds: float, cycles: int) -> bool:
+    state = await slide(operator)
+    return bool(state["age"] >= seconds and state["cycles"] >= cycles)

@@ -25,6 +25,7 @@ from petrobot.services.node.worker_host import HUNG
 from tests import processes
 from tests.node.test_processes import ROOT, Nodes, Operator, operator_of, pids
 from tests.processes import alive
+from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 RECOVERY = 60.0
@@ -202,8 +203,6 @@ async def test_petrobot_nodes_says_up_only_if_a_call_would_be_accepted(
     try:
         async with operator_of(running.directory, "left") as operator:
             assert (await asyncio.to_thread(nodes_command, running.file))["left"]["up"]
-            driver = (await pids(operator, "left", "slide"))["driver"]
-            os.kill(driver, signal.SIGSTOP)
             seen = set()
 
             async def up_again() -> bool:
@@ -212,21 +211,26 @@ async def test_petrobot_nodes_says_up_only_if_a_call_would_be_accepted(
                 seen.add(f"{said}: {about.get('text', '')}")
                 return said == "up" and bool(about["pids"]["driver"] != driver)
 
-            await operator.until(up_again, RECOVERY)
-            assert (await operator.call("go", to=0.0)).status == "success"
             why = (
                 f"the process of its driver died: it did not answer for {HUNG:g} s, and was killed"
             )
+            dead = {f"restarting: {why}", f"not ready: {why}"}
+            times, limit = 0, Limit("an answer while the driver starts again")
+            while not seen & dead and limit.left():  # on a busy host it may be up before that
+                driver = (await pids(operator, "left", "slide"))["driver"]
+                os.kill(driver, signal.SIGSTOP)
+                await operator.until(up_again, RECOVERY)
+                assert (await operator.call("go", to=0.0)).status == "success"
+                times += 1
             assert "no answer: " in seen
             # Its pipe closes a moment before the node has collected the process.
             ending = "restarting: one of its processes is ending"
-            dead = {f"restarting: {why}", f"not ready: {why}"}
-            assert seen <= {"no answer: ", ending, "up: ", *dead} and seen & dead, seen
+            assert seen <= {"no answer: ", ending, "up: ", *dead}, seen
             monkeypatch.setenv("COLUMNS", "400")
             services = ["--services", str(running.file)]
             assert await asyncio.to_thread(main, ["nodes", *services]) == 3
             shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-            assert f"started again 1 times, last because {why}" in shown, shown
+            assert f"started again {times} times, last because {why}" in shown, shown
     finally:
         running.stop()
 

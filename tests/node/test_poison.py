@@ -19,6 +19,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from petrobot.services.action import Result, Status, success
 from petrobot.services.comm.calls.caller import PeerLost
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import ProtocolError, decode, encode
@@ -77,7 +78,7 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneNode]:
 
 @pytest.fixture
 async def operator(node: OneNode) -> AsyncIterator[Operator]:
-    async with operator_of(node.directory, "only") as one:
+    async with operator_of(node.directory, "only", timing=LinkTiming()) as one:
         yield one
 
 

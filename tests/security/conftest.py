@@ -76,6 +76,12 @@ class Victim:
         answer: dict[str, Any] = json.loads(self.process.stdout.readline())
         return answer
 
+    async def only_link(self) -> None:
+        """Wait until one connection is left in its memory."""
+        limit = Limit("the end of all connections but one")
+        while (await asyncio.to_thread(self.about, True))["links"] != 1 and limit.left():
+            await beat()
+
     def memory(self, what: str = "VmRSS") -> int:
         """Its resident set now (or VmHWM: the largest ever), in bytes."""
         lines = Path(f"/proc/{self.process.pid}/status").read_text().splitlines()

@@ -153,24 +153,29 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
     them before the stop is cleared. With `--bus` the bus itself is stopped without waiting for the
     node, and works again afterwards."""
     async with cell_of(tmp_path) as cell:
-        await cell.sweep()
-        assert cell.coordinator is not None
-        cell.coordinator.send_signal(signal.SIGSTOP)
-        code, told = await cell.estop()
-        (node,) = told["nodes"]
-        assert (code, node["node"], set(node["devices"])) == (0, "motion", {"arm"})
-        assert told["coordinator"].endswith("the coordinator does not answer")
+        limit = Limit("a node that answers before its bus is stopped, too")
+        while True:
+            await cell.sweep()
+            assert cell.coordinator is not None and limit.left()
+            cell.coordinator.send_signal(signal.SIGSTOP)
+            code, told = await cell.estop()
+            (node,) = told["nodes"]
+            assert (code, node["node"], set(node["devices"])) == (0, "motion", {"arm"})
+            assert told["coordinator"].endswith("the coordinator does not answer")
+            if not node["bus"]:  # else, on a busy host, the drives say nothing more
+                await cell.heard(without_power)
+                if cell.ear.all_in(DriveState.SWITCH_ON_DISABLED):
+                    break  # else the host was so busy that they missed their master before
+            cell.coordinator.send_signal(signal.SIGCONT)
+            assert (await finished(cell.coordinator))[0] == 1 and await cell.clear() == 0
         await cell.heard(lambda ear: ear.quick_stop_at is not None)
-        await cell.heard(lambda ear: ear.all_in(DriveState.SWITCH_ON_DISABLED))
         await cell.standing()
         cell.coordinator.send_signal(signal.SIGCONT)
         code, _, _ = await finished(cell.coordinator)
         assert code == 1, "the task's own recovery must not have moved the arm"
-        assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED)
+        assert without_power(cell.ear)
         assert await cell.clear() == 0
-        assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED), (
-            "clearing alone moves and enables nothing"
-        )
+        assert without_power(cell.ear), "clearing alone moves and enables nothing"
         await cell.sweep()  # through the task's error branch: an action resets the drives
         code, told = await cell.estop("--bus")
         (node,) = told["nodes"]

@@ -30,7 +30,7 @@ from petrobot.services.host.emergency_latch import latch_of
 from tests.chaos.shuttle_cell import moves, shuttle_services
 from tests.integration.test_two_coordinators import mission_on
 from tests.security.test_estop import finished, petrobot
-from tests.waiting import beat, until
+from tests.waiting import Limit, beat, until
 
 pytestmark = [pytest.mark.processes, pytest.mark.asyncio(loop_scope="module")]
 PATIENCE = 60.0
@@ -137,23 +137,27 @@ class Turns:
         logs = [self.folder / "logs" / f"{name}.log" for name in starts]
         ready = [log.read_text().count("ready on") for log in logs]
         await until(
-            lambda: [log.read_text().count("ready on") for log in logs] > ready,
+            lambda: all(
+                log.read_text().count("ready on") > before
+                for log, before in zip(logs, ready, strict=True)
+            ),
             "both nodes to be ready again",
         )
 
+    def run_of(self, coordinator: subprocess.Popen[str]) -> Path | None:
+        """Return the folder of the run of a coordinator that is connected to the nodes."""
+        assert coordinator.poll() is None, coordinator.communicate()
+        for file in self.runs.glob(f"*/{ADDRESS_FILE}"):
+            if json.loads(file.read_text())["process"] == coordinator.pid:
+                return file.parent
+        return None
+
     async def connected(self, coordinator: subprocess.Popen[str]) -> Path:
         """Wait until a coordinator is connected to the nodes, and return the folder of its run."""
-        found = list[Path]()
-
-        def published() -> bool:
-            assert coordinator.poll() is None, coordinator.communicate()
-            for file in self.runs.glob(f"*/{ADDRESS_FILE}"):
-                if json.loads(file.read_text())["process"] == coordinator.pid:
-                    found.append(file.parent)
-            return bool(found)
-
-        await until(published, "a coordinator that is connected")
-        return found[0]
+        await until(lambda: self.run_of(coordinator), "a coordinator that is connected")
+        run = self.run_of(coordinator)
+        assert run is not None
+        return run
 
 
 def page_address(page: subprocess.Popen[str]) -> str:
@@ -209,7 +213,7 @@ async def test_what_was_frozen_before_a_stop_moves_nothing_after_it_is_cleared(
     for number in range(2 if restarts else 4):
         before = turns.begun()
         first = number == 0
-        coordinator = turns.start(1.5 if first else 0.02)
+        coordinator = turns.start(PATIENCE if first else 0.02)
         try:
             await turns.connected(coordinator)
             if not first:
@@ -259,7 +263,7 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
     coordinator was killed: to resume it is a decision of the operator."""
     run, then = Path(), turns.begun()
     if command == "resume":
-        coordinator = turns.start(1.5)
+        coordinator = turns.start(4.0)
         run = await turns.connected(coordinator)
         coordinator.kill()
         coordinator.communicate()
@@ -273,10 +277,19 @@ async def test_an_order_from_before_a_stop_moves_nothing_after_it_is_cleared(
 
     then = turns.begun()
     for moment in (0.0, 0.1, 0.3) if command == "run" else (0.1,):
-        coordinator = order()
-        try:
+        limit = Limit("a coordinator that is frozen before it has reached a node")
+        while limit.left():
+            coordinator = order()
             await beat(moment)
             coordinator.send_signal(signal.SIGSTOP)
+            if turns.run_of(coordinator) is None:
+                break  # else, on a busy host, the signal was late
+            coordinator.kill()
+            coordinator.communicate()
+            await turns.estop()
+            await turns.estop("--clear")
+            then = turns.begun()
+        try:
             await turns.estop()
             await beat(2 * TRANSIT)  # no person is quicker
             await turns.estop("--clear")
@@ -333,11 +346,13 @@ async def test_a_start_that_a_frozen_page_reads_after_a_stop_moves_nothing(turns
         assert (answer["ok"], answer["code"], turns.begun()) == (False, "stopped", then), answer
         assert "order it again" in answer["text"]
         await beat(ARREARS)
-        # On a busy host the test was silent for so long that the controls are free.
-        assert (await give(address, "take_controls"))["ok"]
-        answer = await give(address, "start", task="turns")
-        assert answer["ok"], answer
-        await turns.moving()
+        limit, answer = Limit("a page that has not stood still again"), {"ok": False}
+        while not answer["ok"]:
+            assert limit.left(), answer
+            # On a busy host the test was silent for so long that the controls are free.
+            assert (await give(address, "take_controls"))["ok"]
+            answer = await give(address, "start", task="turns")
+        await until(lambda: turns.begun() > then, "hands that move in the only turn")
     finally:
         page.kill()
         page.communicate()

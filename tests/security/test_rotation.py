@@ -18,6 +18,7 @@ from tests.node.test_processes import CELL, PATIENCE, start_node
 from tests.ports import free_ports
 from tests.processes import below, kill
 from tests.security.test_streams import GuardedOperator
+from tests.waiting import beat, until
 
 pytestmark = pytest.mark.processes
 PASSES = {
@@ -147,15 +148,19 @@ async def test_a_node_logs_why_a_stream_cannot_be_sent(tmp_path: Path) -> None:
         operator = GuardedOperator(parse(path.read_text(), path))
         try:
             await operator.connect("right")
-            await operator.call("lead", seconds=3.0)
+            leading = asyncio.create_task(operator.call("lead", seconds=PATIENCE))
+            log = tmp_path / "right" / "right.log"
+            says = "stream points: left does not tell where it goes: unreachable"
+            await until(lambda: says in log.read_text(), says)
+            await beat(2.0)
+            leading.cancel()
+            await asyncio.gather(leading, return_exceptions=True)
         finally:
             await operator.close()
     finally:
         for node in list(hosts.nodes):
             hosts.stop(node)
-    says = "stream points: left does not tell where it goes: unreachable"
-    assert says in (log := (tmp_path / "right" / "right.log").read_text())
-    assert log.count(says) < 4, log
+    assert log.read_text().count(says) < 4, log.read_text()
 
 
 @pytest.mark.parametrize(

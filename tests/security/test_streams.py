@@ -3,7 +3,6 @@ stranger's set points move nothing."""
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import time
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from petrobot.services.comm.streams.camera import ImageServer, StreamImages
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver, StreamSender
 from petrobot.services.comm.tls.certificates import make_certificates
 from petrobot.services.comm.tls.credentials import credentials
-from tests.node.test_processes import CELL, Nodes, Operator
+from tests.node.test_processes import CELL, Nodes, Operator, follows
 from tests.waiting import Limit
 
 SHARED = '[keys]\nfile = "cell.key"\n'
@@ -42,7 +41,13 @@ class GuardedOperator(Operator):
             )
             caller, (host, port) = Caller(node, hello, auto_ack=True), self.directory.address(node)
             client = Client(
-                host, port, caller, on_notices=self._take, key=proves.key, tls=proves.client()
+                host,
+                port,
+                caller,
+                on_notices=self._take,
+                key=proves.key,
+                tls=proves.client(),
+                timing=self.timing,
             )
             self.clients[node] = client
             client.start()
@@ -65,11 +70,7 @@ async def test_set_points_between_nodes_with_keys(tmp_path: Path, how: str) -> N
     operator = GuardedOperator(nodes.directory)
     try:
         await operator.connect("left", "right")
-        following = asyncio.create_task(operator.call("follow", seconds=1.5))
-        leading = await operator.call("lead", seconds=1.2)
-        end = await following
-        assert leading.status == "success", leading
-        assert end.values["count"] >= 3 and end.values["position"] > 0.0
+        await follows(operator)
         assert (await operator.call("relay", a=3)).values["sum"] == 5, "node to node"
     finally:
         await operator.close()

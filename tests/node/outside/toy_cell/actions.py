@@ -102,16 +102,21 @@ async def chatter(ctx: Context, *, what: str) -> Result:
         await ctx.sleep(1e-9)
 
 
-async def nap(ctx: Context, *, seconds: float) -> Result:
-    """Wait."""
-    await ctx.sleep(seconds)
+async def nap(ctx: Context, *, seconds: float, gate: str = "") -> Result:
+    """Send progress, then wait; with a `gate`, until this file is removed, if that is earlier."""
+    ctx.progress(0.0)
+    if gate:
+        await ctx.wait(lambda: not Path(gate).exists(), seconds)
+    else:
+        await ctx.sleep(seconds)
     return success(slept=seconds)
 
 
 async def go(ctx: Context, *, to: float, timeout: float = 5.0) -> Result:
-    """Send the slide to a position and wait until it is there."""
+    """Send progress, send the slide to a position, and wait until it is there."""
+    ctx.progress(0.0)
     number = ctx.device.send({"to": to})
-    await ctx.wait(lambda: ctx.device.handled >= number, 1.0)
+    await ctx.wait(lambda: ctx.device.handled >= number, 60.0)
     if ctx.device.refused:
         return error("refused", ctx.device.refused)
     try:
@@ -311,9 +316,16 @@ def slow_disk(ctx: Context, *, seconds: float) -> Result:
     return success()
 
 
-def block(ctx: Context, *, seconds: float) -> Result:
-    """Block the interpreter's only thread, as a driver's library may."""
-    time.sleep(seconds)
+def block(ctx: Context, *, seconds: float, mark: str = "", gate: str = "") -> Result:
+    """Block the interpreter's only thread, as a driver's library may. With a `gate`, make the file
+    `mark`, and block until the file `gate` is removed, if that is earlier."""
+    if gate:
+        Path(mark).touch()
+        end = time.monotonic() + seconds
+        while Path(gate).exists() and time.monotonic() < end:
+            time.sleep(0.005)
+    else:
+        time.sleep(seconds)
     return success(slept=seconds)
 
 
