@@ -8,6 +8,7 @@ loopback without, once with a shared key.
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import subprocess
@@ -27,6 +28,7 @@ from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
+ASKED = itertools.count()
 PLACES = """\
 schema = 1
 [nodes.hub]
@@ -132,6 +134,20 @@ def result_of(
     result = client.expect(f.RESULT, id_)
     client.say(f.RESULT_ACK, id_)
     return result
+
+
+def slide_of(client: Foreign) -> dict[str, Any]:
+    """Ask for the state of the slide. On a busy host its process may be late: the answer says so,
+    and the slide is asked again."""
+    limit = Limit("the state of the slide")
+    while True:
+        limit.left()
+        id_ = f"status {next(ASKED)}"
+        client.say(f.COMMAND, id_, "status")
+        _, _, ok, data = client.expect(f.ANSWER, id_)
+        if ok:
+            state: dict[str, Any] = data["devices"]["slide"]["state"]
+            return state
 
 
 def test_the_example_bytes_of_the_page() -> None:
@@ -279,9 +295,7 @@ def test_events_and_commands(hub: Hub) -> None:
     name = f"value {hub.count}"
     client.say(f.SUBSCRIBE, ["beat"])
     assert client.expect(f.EVENT, "beat")[3] == 0
-    client.say(f.COMMAND, "c1", "status")
-    _, id_, ok, data = client.expect(f.ANSWER)
-    assert (id_, ok) == ("c1", True) and "position" in data["devices"]["slide"]["state"]
+    assert "position" in slide_of(client)
     client.say(f.COMMAND, "c2", "stop", "slide")
     assert client.expect(f.ANSWER, "c2")[3]["answers"]["slide"] in ("stopped", "stopping")
     client.say(f.SUBSCRIBE, [f"memory:{name}"])
@@ -300,11 +314,14 @@ def test_set_points(hub: Hub) -> None:
     hub.opened.append(stream)
     assert stream.open("stream", "hub", node="slide")[0] == f.WELCOME
     stream.say(f.STREAM_OPEN, "points", 0.02, there["ticket"])
-    client.say(f.CALL, f"follow {hub.count}", "follow", {"seconds": 0.6}, 5.0, 1)
-    begun, number = time.monotonic(), 0
-    while time.monotonic() < begun + 0.5:
+    before = slide_of(client)
+    client.say(f.CALL, f"follow {hub.count}", "follow", {"seconds": 2.0}, 60.0, 1)
+    begun, number, slide = time.monotonic(), 0, before
+    limit = Limit("the slide follows")
+    while (slide["count"] <= 5 or slide["position"] == before["position"]) and limit.left():
         number += 1
-        stream.say(f.SET_POINT, number, [0.2 * number / 25], 0.0, time.monotonic() - begun)
+        passed = time.monotonic() - begun
+        stream.say(f.SET_POINT, number, [0.2 * min(number, 25) / 25], 0.0, passed)
         due = begun + 0.02 * number
         while (left := due - time.monotonic()) > 0:
             stream.socket.settimeout(max(left, 1e-4))
@@ -312,9 +329,11 @@ def test_set_points(hub: Hub) -> None:
                 stream.hear()
             except TimeoutError:
                 continue
+        slide = slide_of(client)
     stream.say(f.WITHDRAW)
     end = client.expect(f.RESULT, f"follow {hub.count}")
-    assert end[2] == "success" and end[3]["count"] > 5 and end[3]["position"] != 0.0
+    assert end[2] == "success" and end[3]["count"] > 5
+    assert end[3]["position"] not in (0.0, before["position"])
     client.say(f.BYE)
 
 
