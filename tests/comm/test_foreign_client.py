@@ -198,15 +198,15 @@ def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
     """A CALL with a known id gets its stored result, or `forgotten` after that was acknowledged."""
     client = hub.coordinator()
     id_ = f"once {hub.count}"
-    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 60.0, 1)
     first = client.hear()
     if first == [f.ACCEPT, id_]:  # ACCEPT is left out if the result comes within 2 ms.
         first = client.hear()
     assert first[:4] == [f.RESULT, id_, "success", {"sum": 5}]
-    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 60.0, 1)
     assert client.hear() == first, "the same result, the seconds that it took included"
     client.say(f.RESULT_ACK, id_, ["another"])
-    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 60.0, 1)
     assert client.hear()[2:7:2] == ["error", "forgotten", "unknown"]
 
 
@@ -215,17 +215,17 @@ def test_results_lost_with_the_link_are_listed_and_sent_again(hub: Hub) -> None:
     result."""
     client = hub.coordinator()
     name = f"foreign{hub.count}"
-    client.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
+    client.say(f.CALL, f"{name}/done", "add", {"a": 1}, 60.0, 1)
     client.expect(f.RESULT, f"{name}/done")
-    client.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 5.0, 1)
+    client.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 60.0, 1)
     client.expect(f.ACCEPT, f"{name}/on")
     client.close()
     again = hub.knock()
     runs = again.open("coordinator", name, epoch=1)[5]
     assert set(runs) == {f"{name}/done", f"{name}/on"}
-    again.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 5.0, 1)
+    again.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 60.0, 1)
     assert again.expect(f.RESULT, f"{name}/on")[3] == {"slept": 0.4}
-    again.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
+    again.say(f.CALL, f"{name}/done", "add", {"a": 1}, 60.0, 1)
     assert again.expect(f.RESULT, f"{name}/done")[3] == {"sum": 2}
 
 
@@ -267,12 +267,13 @@ def test_a_refusal_is_a_result(
 
 def test_one_caller_at_a_time_holds_a_device(hub: Hub) -> None:
     """BYE releases the lease; until then the node accepts no orders of other callers."""
-    first, second = hub.coordinator(), hub.coordinator()
-    assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
-    assert result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 5.0, 1)[4] == "device_leased"
+    first = hub.coordinator()
+    assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 60.0, 1)[2] == "success"
+    second = hub.coordinator()  # not before: it would be silent while the other one waits
+    assert result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 60.0, 1)[4] == "device_leased"
     first.say(f.BYE, "enough")
     assert first.socket.recv(1) == b"", "the node hangs up, too"
-    assert result_of(second, f"lease {hub.count}c", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
+    assert result_of(second, f"lease {hub.count}c", "go", {"to": 0.0}, 60.0, 1)[2] == "success"
     second.say(f.BYE)
 
 
@@ -281,7 +282,10 @@ def test_heartbeats(hub: Hub) -> None:
     silent."""
     client = hub.coordinator()
     client.say(f.PING, 2**63 - 1)
-    assert f.unpack(client.body()) == [f.PONG, 2**63 - 1]
+    message, limit = f.unpack(client.body()), Limit("the PONG")
+    while message[0] == f.PING and limit.left():  # on a busy host we were silent before
+        message = f.unpack(client.body())
+    assert message == [f.PONG, 2**63 - 1]
     assert f.unpack(client.body())[0] == f.PING
     with pytest.raises(ConnectionError):
         while True:
