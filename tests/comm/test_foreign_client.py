@@ -270,7 +270,9 @@ def test_one_caller_at_a_time_holds_a_device(hub: Hub) -> None:
     first = hub.coordinator()
     assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 60.0, 1)[2] == "success"
     second = hub.coordinator()  # not before: it would be silent while the other one waits
-    assert result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 60.0, 1)[4] == "device_leased"
+    assert (
+        result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 60.0, 1)[4] == "device_leased"
+    )
     first.say(f.BYE, "enough")
     assert first.socket.recv(1) == b"", "the node hangs up, too"
     assert result_of(second, f"lease {hub.count}c", "go", {"to": 0.0}, 60.0, 1)[2] == "success"
