@@ -8,6 +8,8 @@ import secrets
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -310,9 +312,10 @@ def local_programs(
 
     In lock step they wait `awaited` seconds (wall time) for a coordinator that died.
     """
-    local = sorted(
-        (n for n in directory.nodes.values() if is_local(n.host)), key=lambda node: not node.sim
-    )
+    nodes = sorted(directory.nodes.values(), key=lambda node: not node.sim)
+    with ThreadPoolExecutor(32) as lookups:  # all at once: a name server may not answer
+        here = lookups.map(is_local, [node.host for node in nodes])
+        local = list(compress(nodes, here))
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
     options += ["--log-level", log_level, *(["--dry-run"] if directory.dry_run else [])]

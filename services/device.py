@@ -220,6 +220,8 @@ class Key:
             dict: "a table",
         }
         limits = " and ".join(f"{_BOUNDS[b][0]} {end:g}" for b, end in self.bounds.items())
+        if self.bounds.keys() == {"least", "most"}:
+            limits = "from {least:g} to {most:g}".format(**self.bounds)
         wish = " ".join(filter(None, (words.get(self.kind, "a value"), limits)))
         wish = " or ".join(f'"{text}"' for text in self.choices) or wish
         return wish + (f" ({self.text})" if self.text else "")

@@ -4,6 +4,7 @@ recorded runs."""
 from __future__ import annotations
 
 import argparse
+import getpass
 import logging
 import os
 import sys
@@ -11,6 +12,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.services.host.command_line import whole, write_in_thread
@@ -107,6 +109,19 @@ def named_port(port: int) -> Iterator[None]:
         why = os.strerror(fault.errno) if fault.errno else str(fault)
         text = f"port {port}: {why}; choose another with --page-port"
         raise CommandError(2, text) from fault
+
+
+def page_line(url: str) -> str:
+    """Return the line with the page's address. In an SSH session there is a second one: how the
+    browser of the user's own computer reaches the page."""
+    said = os.environ.get("SSH_CONNECTION", "").split()
+    if len(said) != 4:
+        return f"page: {url}"
+    _, _, host, ssh = said
+    port = urlsplit(url).port
+    other = f" -p {ssh}" if ssh != "22" else ""
+    tunnel = f"ssh{other} -L {port}:127.0.0.1:{port} {getpass.getuser()}@{host}"
+    return f"page: {url}\non your own computer: run `{tunnel}`, then open the same address there"
 
 
 # Logging of the coordinator: one logger per package, to standard error.

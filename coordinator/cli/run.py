@@ -32,6 +32,7 @@ from petrobot.coordinator.cli.options import (
     add_page_port_argument,
     journal_folder,
     named_port,
+    page_line,
     pairs,
     parameter_of,
     parameter_texts,
@@ -407,7 +408,7 @@ async def served(session: RunSession, options: argparse.Namespace) -> AsyncItera
             page=not options.no_page,
         )
     if not options.no_page:
-        print(f"page: {page.url}", file=sys.stderr, flush=True)
+        print(page_line(page.url), file=sys.stderr, flush=True)
     services = str(directory.source.resolve())
     session.address = RunAddress(session.identity, page.base, page.token, os.getpid(), services)
     try:

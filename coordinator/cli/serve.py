@@ -24,6 +24,7 @@ from petrobot.coordinator.cli.options import (
     add_log_level_argument,
     add_page_port_argument,
     named_port,
+    page_line,
 )
 from petrobot.services.host.command_line import done_before
 
@@ -135,7 +136,7 @@ async def _page(
         )
     station.address = _addresses(station.directory, page)
     try:
-        print(f"page: {page.url}\nCtrl-C stops it", flush=True)
+        print(f"{page_line(page.url)}\nCtrl-C stops it", flush=True)
         await stop.wait()
         await station.close()
     finally:

@@ -9,7 +9,11 @@ from __future__ import annotations
 
 import importlib
 import os
+import sys
 from typing import TYPE_CHECKING, Any
+
+if sys.platform != "linux":
+    raise ImportError("petrobot needs Linux, also in WSL 2, a container or a virtual machine")
 
 # Before numpy is loaded. The threads of OpenBLAS wait for each other in busy loops: where a robot's
 # processes share the cores, inverting a matrix of 128 rows takes a hundred times as long with them.

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import resource
+import runpy
 import socket
 import struct
 import subprocess
@@ -16,10 +17,12 @@ from pathlib import Path
 
 import pytest
 
+import petrobot as petrobot_package
 from petrobot.coordinator.analysis import commands, may_run
 from petrobot.coordinator.analysis.formats import read_net
 from petrobot.coordinator.analysis.net.space import explore
 from petrobot.coordinator.cli import COMMANDS, Subcommand, analyse as cli_analyse, loading, main
+from petrobot.coordinator.cli.options import page_line
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -812,3 +815,30 @@ def tally(ctx: Context, *, cycles: list) -> Result:
     again = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
     assert again["counted"] > 0 and "unscored" not in again
     assert again["goals"] == first["goals"]
+
+
+@pytest.mark.parametrize(
+    ("connection", "tunnel"),
+    [
+        ("192.0.2.9 50312 192.0.2.7 22", "`ssh -L 8377:127.0.0.1:8377 eva@192.0.2.7`"),
+        ("2001:db8::9 5 2001:db8::7 2222", "`ssh -p 2222 -L 8377:127.0.0.1:8377 eva@2001:db8::7`"),
+        ("", ""),
+    ],
+)
+def test_over_ssh_the_page_comes_with_the_command_for_its_tunnel(
+    connection: str, tunnel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSH_CONNECTION", connection)
+    monkeypatch.setenv("LOGNAME", "eva")
+    page, *more = page_line("http://127.0.0.1:8377/?token=x").splitlines()
+    assert page == "page: http://127.0.0.1:8377/?token=x"
+    assert tunnel in "".join(more) and bool(more) is bool(tunnel)
+
+
+@pytest.mark.parametrize("system", ["darwin", "win32"])
+def test_another_operating_system_is_named(system: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wheel installs everywhere; the first missing module said nothing to its user."""
+    assert petrobot_package.__file__ is not None
+    monkeypatch.setattr(sys, "platform", system)
+    with pytest.raises(ImportError, match=r"^petrobot needs Linux, "):
+        runpy.run_path(petrobot_package.__file__)

@@ -7,13 +7,17 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 from configparser import RawConfigParser
 from pathlib import Path
 
 import pytest
 
+from petrobot.coordinator import launch
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.up import only_here
+from petrobot.coordinator.launch import local_programs
+from petrobot.services.comm.location_file import parse
 
 SERVICES = 'schema = 1\n[nodes.left]\nhost = "127.0.0.1"\nport = 4901\n'
 
@@ -73,3 +77,20 @@ def test_a_name_that_only_this_host_knows_as_loopback(
         socket, "getaddrinfo", lambda name, *rest, **more: known(address, *rest, **more)
     )
     assert only_here(host).startswith(said) and bool(only_here(host)) is bool(said)
+
+
+def test_hosts_are_looked_up_at_the_same_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a name server each lookup takes ten seconds; `up` made them in turn."""
+    names = ("vision", "arm", "base")
+    nodes = "".join(f'{n} = {{ host = "{n}.example", port = 4901 }}\n' for n in names)
+    directory = parse(f"schema = 1\n[nodes]\n{nodes}", tmp_path / "services.toml")
+    together = threading.Barrier(len(names))
+
+    def look_up(host: str) -> bool:
+        together.wait(60.0)
+        return host == "arm.example"
+
+    monkeypatch.setattr(launch, "is_local", look_up)
+    assert [program.name for program in local_programs(directory)] == ["arm"]

@@ -107,6 +107,7 @@ def test_a_wrong_key_is_refused_by_name(config: dict[str, Any], words: str) -> N
         ({"opening": -1}, "opening: expected a number above 0 and at most 0.1 (m), found -1"),
         ({"opening": 0.11}, "opening: expected a number above 0 and at most 0.1 (m), found 0.11"),
         ({"opening": "0.05"}, "opening: expected a number above 0 and at most 0.1 (m), found"),
+        ({"share": 1.1}, "share: expected a number from 0 to 1, found 1.1"),
         ({"tries": -1}, "tries: expected a whole number of at least 0, found -1"),
         ({"side": "up"}, 'side: expected "left" or "right" (of the belt), found \'up\''),
         ({"side": ["left"]}, 'side: expected "left" or "right" (of the belt), found [\'left\']'),
@@ -120,9 +121,10 @@ def test_a_value_outside_the_limits_of_its_key_is_refused(
         tries: int = key(0, least=0)
         side: str = key("left", "of the belt", choices=("left", "right"))
         offset: float = key(None, least=0)
+        share: float = key(1.0, least=0, most=1)
 
     read = read_keys(Gripper, {"opening": 0.1, "tries": 0, "side": "right"})
-    assert read == {"opening": 0.1, "tries": 0, "side": "right", "offset": None}
+    assert read == {"opening": 0.1, "tries": 0, "side": "right", "offset": None, "share": 1.0}
     with pytest.raises(ValueError, match="^" + re.escape(words)):
         read_keys(Gripper, config)
 

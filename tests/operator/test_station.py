@@ -21,7 +21,7 @@ from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
 from petrobot.coordinator.run.journal import read_journal
 from tests.operator.conftest import TASK, Cell
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S, Limit, until
 
 pytestmark = pytest.mark.processes
 
@@ -90,7 +90,8 @@ async def test_a_resumed_run_is_shown_as_it_was(cell: Cell, tmp_path: Path) -> N
     assert (await cell.say("override_selector", primitive_task="pick", action="pick_part"))["ok"]
     run_session = cell.station._run
     assert run_session is not None
-    while True:
+    limit = Limit("a run that is held")
+    while limit.left():
         assert (await cell.say("pause"))["ok"]
         await until(lambda: run_session.mission.executor.store.safe)
         before = cell.station.snapshot()

@@ -357,8 +357,9 @@ class Client:
 
     async def _reach(self) -> _ClientLink:
         # Several addresses in turn would not do: the attempt ends while the first one is silent.
-        addresses, next_one = await self._look_up(), self.timing.silence / 4
-        found = await start_connection(addresses, happy_eyeballs_delay=next_one)
+        addresses = await self._look_up()
+        pause = self.timing.silence / (2 * len(addresses))
+        found = await start_connection(addresses, happy_eyeballs_delay=pause)
         name = self.caller.peer if self.tls is not None else None
         _, link = await self._loop.create_connection(
             lambda: _ClientLink(self), sock=found, ssl=self.tls, server_hostname=name
