@@ -14,6 +14,7 @@ import pytest
 import pytest_asyncio
 
 from petrobot.coordinator.cli import main
+from petrobot.coordinator.engine import Mode
 from petrobot.coordinator.launch import Setting, realtime_mission
 from petrobot.coordinator.operator.commands import Operation
 from petrobot.coordinator.operator.run_address import RunAddress, published
@@ -102,7 +103,7 @@ class Terminal:
 
 @asynccontextmanager
 async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Terminal]:
-    """A mission run that has begun and waits for its first part."""
+    """A mission run that has begun, which is in its journal, and waits for its first part."""
     directory = directory_in(folder)
     robot = RobotNode(directory)
     await robot.start()
@@ -118,6 +119,7 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     operation = Operation(shell, selector)
     page = await start_page(operation, tasks_folder=folder, page=False)
     running = asyncio.create_task(shell.run())
+    await until(lambda: mission.executor.state.mode is Mode.RUNNING and store.safe)
     address = RunAddress(RUN, page.base, page.token, os.getpid(), str(directory.source))
     with published(journal.parent, address):
         yield Terminal(operation, shell, page, robot, folder, read, running)

@@ -12,7 +12,7 @@ class Axis(Driver):
 
     period = 0.01  # s between two steps; without it the driver has no `step`, and nothing moves
     obeys = ("speed", "workspace", "dry_run", "pause")  # see self.speed, self.paused ... below
-    top_speed: float = key(0.5, "m/s")
+    top_speed: float = key(0.5, "m/s", above=0)
     length: float = key(1.0, "m, from end to end")
 
     def setup(self) -> None:

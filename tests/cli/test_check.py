@@ -258,7 +258,7 @@ def test_two_cells_of_one_process_may_have_modules_of_the_same_name(
         (folder / "services.toml").write_text(
             f'{text}actions.go = {{ run = "robot:{name}", node = "pc" }}\n'
         )
-        code = read_code(load(folder / "services.toml"), seconds=5.0)
+        code = read_code(load(folder / "services.toml"))
         assert "import" not in code[f"robot:{name}"], code
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli import check, main
 from tests.cli.cell import SERVICES, TASK, RobotNode, directory_in
+from tests.waiting import PATIENCE_S
 
 
 async def said_of(
@@ -26,9 +27,10 @@ async def said_of(
 
 @pytest.mark.processes
 async def test_nodes_that_offer_everything(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The nodes are up with the same file: the task may run."""
+    monkeypatch.setattr(check, "PATIENCE", PATIENCE_S)
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
     await robot.start()
@@ -53,10 +55,11 @@ async def test_a_node_that_is_not_running(
 
 @pytest.mark.processes
 async def test_a_node_with_an_older_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A node that was started with another services.toml refuses callers that have this one, and
     the check reports it."""
+    monkeypatch.setattr(check, "PATIENCE", PATIENCE_S)
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
     await robot.start()

@@ -372,4 +372,4 @@ def test_scripted_and_other_programs_refuse_each_other(
             assert ("mock" if scripted else "real") in capsys.readouterr().out
         finally:
             process.terminate()
-            process.wait(10.0)
+            process.wait(60.0)

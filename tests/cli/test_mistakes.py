@@ -301,7 +301,7 @@ IN_THE_CELL: list[Mistake] = [
         CELL,
         "speed = 0.5",
         'speed = "fast"',
-        r":LINE: devices.axis.top_speed: expected a number \(m/s\), found 'fast'",
+        r":LINE: devices.axis.top_speed: expected a number above 0 \(m/s\), found 'fast'",
     ),
     (
         CELL,
@@ -322,7 +322,7 @@ IN_THE_CELL: list[Mistake] = [
         r":LINE: devices.axis.max_speed: unknown key; did you mean 'top_speed'",
     ),
     (CELL, "top_speed = 0.5", "speed = nan", r":LINE: .*the normal speed, found nan"),
-    (CELL, "top_speed = 0.5", "top_speed = inf", r":LINE: .*a number \(m/s\), found inf"),
+    (CELL, "top_speed = 0.5", "top_speed = inf", r":LINE: .*above 0 \(m/s\), found inf"),
     (
         CELL,
         "top_speed = 0.5",
@@ -427,7 +427,7 @@ IN_THE_CODE: list[Mistake] = [
     (CODE, "def step(", "def steps(", r"`steps` of Axis is never called; did you mean `step`"),
     (
         CODE,
-        'top_speed: float = key(0.5, "m/s")',
+        'top_speed: float = key(0.5, "m/s", above=0)',
         "top_speed: float = 0.5",
         r":7: .*Axis does not read it; write top_speed = key\(0.5\) in the class",
     ),

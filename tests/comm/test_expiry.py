@@ -292,7 +292,7 @@ async def test_nodes_shows_the_expiry_of_the_certificate_in_use(
         places.write_text(text, encoding="utf-8")
         server.callee.directory = ""
         answering = asyncio.create_task(_answer(server))
-        answer = (await ask_all(parse(text, places), 5.0))["vision"]
+        answer = (await ask_all(parse(text, places), 60.0))["vision"]
         assert datetime.fromisoformat(answer["certificate_ends"]) == NOW + 12 * DAY
         capsys.readouterr()
         asked = ["nodes", "--services", str(places), "--timeout", "30"]

@@ -8,6 +8,7 @@ loopback without, once with a shared key.
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import subprocess
@@ -27,6 +28,7 @@ from tests.waiting import Limit
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
+ASKED = itertools.count()
 PLACES = """\
 schema = 1
 [nodes.hub]
@@ -134,6 +136,20 @@ def result_of(
     return result
 
 
+def slide_of(client: Foreign) -> dict[str, Any]:
+    """Ask for the state of the slide. On a busy host its process may be late: the answer says so,
+    and the slide is asked again."""
+    limit = Limit("the state of the slide")
+    while True:
+        limit.left()
+        id_ = f"status {next(ASKED)}"
+        client.say(f.COMMAND, id_, "status")
+        _, _, ok, data = client.expect(f.ANSWER, id_)
+        if ok:
+            state: dict[str, Any] = data["devices"]["slide"]["state"]
+            return state
+
+
 def test_the_example_bytes_of_the_page() -> None:
     """A client with its own msgpack makes both examples."""
     client = Foreign.__new__(Foreign)
@@ -182,15 +198,15 @@ def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
     """A CALL with a known id gets its stored result, or `forgotten` after that was acknowledged."""
     client = hub.coordinator()
     id_ = f"once {hub.count}"
-    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 60.0, 1)
     first = client.hear()
     if first == [f.ACCEPT, id_]:  # ACCEPT is left out if the result comes within 2 ms.
         first = client.hear()
     assert first[:4] == [f.RESULT, id_, "success", {"sum": 5}]
-    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 60.0, 1)
     assert client.hear() == first, "the same result, the seconds that it took included"
     client.say(f.RESULT_ACK, id_, ["another"])
-    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
+    client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 60.0, 1)
     assert client.hear()[2:7:2] == ["error", "forgotten", "unknown"]
 
 
@@ -199,17 +215,17 @@ def test_results_lost_with_the_link_are_listed_and_sent_again(hub: Hub) -> None:
     result."""
     client = hub.coordinator()
     name = f"foreign{hub.count}"
-    client.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
+    client.say(f.CALL, f"{name}/done", "add", {"a": 1}, 60.0, 1)
     client.expect(f.RESULT, f"{name}/done")
-    client.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 5.0, 1)
+    client.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 60.0, 1)
     client.expect(f.ACCEPT, f"{name}/on")
     client.close()
     again = hub.knock()
     runs = again.open("coordinator", name, epoch=1)[5]
     assert set(runs) == {f"{name}/done", f"{name}/on"}
-    again.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 5.0, 1)
+    again.say(f.CALL, f"{name}/on", "nap", {"seconds": 0.4}, 60.0, 1)
     assert again.expect(f.RESULT, f"{name}/on")[3] == {"slept": 0.4}
-    again.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
+    again.say(f.CALL, f"{name}/done", "add", {"a": 1}, 60.0, 1)
     assert again.expect(f.RESULT, f"{name}/done")[3] == {"sum": 2}
 
 
@@ -251,12 +267,15 @@ def test_a_refusal_is_a_result(
 
 def test_one_caller_at_a_time_holds_a_device(hub: Hub) -> None:
     """BYE releases the lease; until then the node accepts no orders of other callers."""
-    first, second = hub.coordinator(), hub.coordinator()
-    assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
-    assert result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 5.0, 1)[4] == "device_leased"
+    first = hub.coordinator()
+    assert result_of(first, f"lease {hub.count}", "go", {"to": 0.0}, 60.0, 1)[2] == "success"
+    second = hub.coordinator()  # not before: it would be silent while the other one waits
+    assert (
+        result_of(second, f"lease {hub.count}b", "go", {"to": 0.0}, 60.0, 1)[4] == "device_leased"
+    )
     first.say(f.BYE, "enough")
     assert first.socket.recv(1) == b"", "the node hangs up, too"
-    assert result_of(second, f"lease {hub.count}c", "go", {"to": 0.0}, 5.0, 1)[2] == "success"
+    assert result_of(second, f"lease {hub.count}c", "go", {"to": 0.0}, 60.0, 1)[2] == "success"
     second.say(f.BYE)
 
 
@@ -265,7 +284,10 @@ def test_heartbeats(hub: Hub) -> None:
     silent."""
     client = hub.coordinator()
     client.say(f.PING, 2**63 - 1)
-    assert f.unpack(client.body()) == [f.PONG, 2**63 - 1]
+    message, limit = f.unpack(client.body()), Limit("the PONG")
+    while message[0] == f.PING and limit.left():  # on a busy host we were silent before
+        message = f.unpack(client.body())
+    assert message == [f.PONG, 2**63 - 1]
     assert f.unpack(client.body())[0] == f.PING
     with pytest.raises(ConnectionError):
         while True:
@@ -279,9 +301,7 @@ def test_events_and_commands(hub: Hub) -> None:
     name = f"value {hub.count}"
     client.say(f.SUBSCRIBE, ["beat"])
     assert client.expect(f.EVENT, "beat")[3] == 0
-    client.say(f.COMMAND, "c1", "status")
-    _, id_, ok, data = client.expect(f.ANSWER)
-    assert (id_, ok) == ("c1", True) and "position" in data["devices"]["slide"]["state"]
+    assert "position" in slide_of(client)
     client.say(f.COMMAND, "c2", "stop", "slide")
     assert client.expect(f.ANSWER, "c2")[3]["answers"]["slide"] in ("stopped", "stopping")
     client.say(f.SUBSCRIBE, [f"memory:{name}"])
@@ -300,11 +320,14 @@ def test_set_points(hub: Hub) -> None:
     hub.opened.append(stream)
     assert stream.open("stream", "hub", node="slide")[0] == f.WELCOME
     stream.say(f.STREAM_OPEN, "points", 0.02, there["ticket"])
-    client.say(f.CALL, f"follow {hub.count}", "follow", {"seconds": 0.6}, 5.0, 1)
-    begun, number = time.monotonic(), 0
-    while time.monotonic() < begun + 0.5:
+    before = slide_of(client)
+    client.say(f.CALL, f"follow {hub.count}", "follow", {"seconds": 2.0}, 60.0, 1)
+    begun, number, slide = time.monotonic(), 0, before
+    limit = Limit("the slide follows")
+    while (slide["count"] <= 5 or slide["position"] == before["position"]) and limit.left():
         number += 1
-        stream.say(f.SET_POINT, number, [0.2 * number / 25], 0.0, time.monotonic() - begun)
+        passed = time.monotonic() - begun
+        stream.say(f.SET_POINT, number, [0.2 * min(number, 25) / 25], 0.0, passed)
         due = begun + 0.02 * number
         while (left := due - time.monotonic()) > 0:
             stream.socket.settimeout(max(left, 1e-4))
@@ -312,9 +335,11 @@ def test_set_points(hub: Hub) -> None:
                 stream.hear()
             except TimeoutError:
                 continue
+        slide = slide_of(client)
     stream.say(f.WITHDRAW)
     end = client.expect(f.RESULT, f"follow {hub.count}")
-    assert end[2] == "success" and end[3]["count"] > 5 and end[3]["position"] != 0.0
+    assert end[2] == "success" and end[3]["count"] > 5
+    assert end[3]["position"] not in (0.0, before["position"])
     client.say(f.BYE)
 
 

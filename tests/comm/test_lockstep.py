@@ -23,6 +23,7 @@ from petrobot.services.comm.lockstep.party import TICK, Envelope, Party, Posted
 from petrobot.services.comm.protocol import messages as m
 from tests.comm.ends import frame
 from tests.comm.toy_party import Toy
+from tests.ports import free_ports
 from tests.waiting import Limit
 
 TOY = Path(__file__).parent / "toy_party.py"
@@ -148,9 +149,7 @@ def test_one_process_and_four_processes_receive_the_same_messages(seed: int) -> 
             for tick in range(ticks)
         }
     delays = {"image": 3, "motion.toy/sim.toy": 2 + seed}
-    listeners, addresses = _listeners(NAMES)
-    for listener in listeners.values():
-        listener.close()
+    addresses = {name: ("127.0.0.1", port) for name, port in zip(NAMES, free_ports(4), strict=True)}
     arguments = [json.dumps(one) for one in (ticks, addresses, scripts, delays)]
     processes = [
         subprocess.Popen(

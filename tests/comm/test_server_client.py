@@ -158,7 +158,7 @@ async def test_a_peer_is_reached_though_one_of_its_addresses_is_dead(
     with dead_address(port):
         coordinator = Coordinator(name, port, key=key)
         try:
-            assert await coordinator.client.connected(10.0)
+            assert await coordinator.client.connected(60.0)
         finally:
             await coordinator.client.close()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import socket
-import time
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import count
@@ -154,19 +153,23 @@ def test_a_stream_from_its_first_value_to_its_end(
 def test_after_an_emergency_stop_a_new_connection_does_not_make_a_run_new(
     began: str, counts: bool, sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
-    """Nor does a run that published nothing before, such as that of a frozen process."""
-    wait_for(lambda: bool(sink.got), lambda: sender.send((1.0,), run="old"), receiver.poll)
-    start = time.monotonic()
+    """Nor does a run that published nothing before, such as that of a frozen process. On a clock
+    of the test: for a process that stands still here, a later run would be an older one."""
+    now = [0.0]
+    receiver._clock = sender._clock = lambda: now[0]
+
+    def send(run: str, age: float) -> None:
+        sender.send((1.0,), run=run, age=age)
+        receiver.poll()
+        now[0] += 0.002
+
+    wait_for(lambda: bool(sink.got), lambda: send("old", 0.0))
+    start = now[0]
     receiver.bar()
     if began == "after":
-        time.sleep(0.3)  # more than the connection takes
-        start = time.monotonic()
-
-    def send() -> None:
-        sender.send((2.0,), run="new", age=time.monotonic() - start)
-
-    end = time.monotonic() + 1.0
-    wait_for(lambda: time.monotonic() > end or sink.got[-1] is not None, send, receiver.poll)
+        start = now[0] = now[0] + 0.3  # more than the connection takes
+    end = now[0] + 1.0
+    wait_for(lambda: now[0] > end or sink.got[-1] is not None, lambda: send("new", now[0] - start))
     assert sender.up and (sink.got[-1] is not None) is counts
 
 

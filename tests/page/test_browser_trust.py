@@ -3,7 +3,6 @@ show, connections that fail."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 from collections.abc import Callable
@@ -22,7 +21,7 @@ if browser_missing() and os.environ.get("CI") != "true":
 from playwright.async_api import Browser, Page as Tab, WebSocketRoute, expect
 
 from tests.page.steps import Watch, element, opened, start_mission
-from tests.waiting import until
+from tests.waiting import Limit, beat, until
 
 Mangle = Callable[[str], str | bytes]
 
@@ -264,10 +263,10 @@ async def test_missing_changes_are_asked_for_once(
     await tab.goto(page.url)
     await expect(element(tab, "^Control place parts", "Task net")).to_be_visible()
     dropping.append(True)
-    for parts in range(9):
-        stage.feed.emit("marking", marking={"parts": parts})
-        await asyncio.sleep(0.05)
-    await tab.wait_for_function("() => petrobot.link.gaps > 3")
+    limit = Limit("further messages that do not follow the last one")
+    while await tab.evaluate("petrobot.link.gaps") <= 3 and limit.left():
+        stage.feed.emit("marking", marking={"parts": 7})  # what waits together is one message
+        await beat(0.05)
     assert len(asked) == 1
     await until(lambda: bool(held))
     old = json.dumps({**json.loads(held[-1]), "sequence": 0})

@@ -422,8 +422,9 @@ clear = { run = "hands_of_this_test:clear", node = "pc" }
 """
 HANDS = """import pathlib, threading
 here = pathlib.Path(__file__).parent
+hangs = (here / "hangs.txt").exists()
 (here / "importing.txt").touch()
-if (here / "hangs.txt").exists():
+if hangs:
     threading.Event().wait()
 from petrobot import success
 async def look(ctx):

@@ -204,7 +204,6 @@ async def test_controls_become_free_when_their_holder_is_gone(
 ) -> None:
     """A holder whose last window was closed does not block others for ever; one that only reloads
     the page keeps them."""
-    monkeypatch.setattr(app_state, "ABSENT_S", 0.3)
     async with joined(page, "ben", "2") as ben:
         async with joined(page) as ana:
             await ana.command("take_controls")
@@ -212,6 +211,7 @@ async def test_controls_become_free_when_their_holder_is_gone(
             await again.until(lambda s: s["controls"]["holder"] == s["you"])
             await ben.command("ask_controls")
             assert ben.state["controls"]["holder"] is not None
+            monkeypatch.setattr(app_state, "ABSENT_S", 0.3)  # not while she connects again
         await ben.until(lambda s: s["controls"]["holder"] is None)
 
 

@@ -51,7 +51,7 @@ node = "arm"
 SCRIPT = """\
 schema = 1
 [[actions.look_at_table]]
-seconds = 5.0
+seconds = 8.0 # until it is paused; a task that is drawn has a deadline of 10 s
 [[actions.look_at_table]]
 seconds = 0.3
 [[actions.look_at_table]]

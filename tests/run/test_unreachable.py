@@ -37,7 +37,7 @@ async def unreachable(task: Task, folder: Path, *refusing: str) -> str:
         realtime_mission(directory, Setting(task), "m1"), directory, credentials_of(directory)
     )
     with pytest.raises(UnreachableError) as fault:
-        await shell.connect(0.5)
+        await shell.connect(2.0)
     await asyncio.gather(shell.close(), *(server.close() for server in servers))
     assert set(fault.value.nodes) == set(NAMES)
     return str(fault.value)
