@@ -75,7 +75,7 @@ steer = {{ run = "steering:steer", node = "pc" }}
 [actions.drive]
 run = "petrobot.services.adapters.ros2.actions:drive"
 device = "base"
-args = {{ streams = ["speed"], seconds = 0.6 }}
+args = {{ streams = ["speed"], seconds = 3.0 }}
 [actions.speeds]
 run = "petrobot.services.adapters.ros2.actions:call"
 device = "base"
@@ -112,7 +112,7 @@ from petrobot import success
 
 async def steer(ctx):
     ctx.publish("speed", [0.5, 0.1])
-    await ctx.sleep(0.3)
+    await ctx.sleep(1.5)  # longer than a busy host needs to begin `drive`, too
     return success()
 """
 
