@@ -35,7 +35,7 @@ from petrobot.coordinator.cli import loading
 from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
-from tests.waiting import Limit
+from tests.waiting import PATIENCE_S, Limit
 
 CATCH = Path(loading.__file__).parents[1] / "tasks" / "catch_ball.toml"
 pytestmark = pytest.mark.processes
@@ -494,7 +494,7 @@ def _start_up(folder: Path, *arguments: str) -> float:
 def _interrupt_after(process: subprocess.Popen[str], seconds: float) -> None:
     """Send Ctrl-C as soon as the process has used that much processor time."""
     ticks, statistics = os.sysconf("SC_CLK_TCK"), Path(f"/proc/{process.pid}/stat")
-    limit = Limit(f"{seconds} s of processor time")
+    limit = Limit(f"{seconds} s of processor time", 4 * PATIENCE_S)
     while process.poll() is None and limit.left():
         fields = statistics.read_text().rpartition(")")[2].split()
         if (int(fields[11]) + int(fields[12])) / ticks >= seconds:

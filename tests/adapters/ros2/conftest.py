@@ -32,7 +32,9 @@ class FakeProcess:
 
     def log(self, *operations: str) -> list[dict[str, Any]]:
         """What it has received, of these operations."""
-        with urllib.request.urlopen(self.url.replace("ws", "http", 1) + "log", timeout=PATIENCE_S) as told:
+        with urllib.request.urlopen(
+            self.url.replace("ws", "http", 1) + "log", timeout=PATIENCE_S
+        ) as told:
             return [m for m in json.load(told) if not operations or m["op"] in operations]
 
     def post(self, verb: str, text: str = "") -> None:
