@@ -446,7 +446,7 @@ def test_a_net_that_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "net", [philosophers(60), kanban(5)], ids=["300 places", "2.5 million markings"]
+    "net", [philosophers(60), kanban(6)], ids=["300 places", "11 million markings"]
 )
 @pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.proof)])
 def test_ctrl_c_keeps_what_was_found(net: Net, share: float, tmp_path: Path) -> None:
