@@ -385,7 +385,7 @@ def test_an_analysis_uses_no_more_memory_than_allowed(tmp_path: Path) -> None:
         [sys.executable, "-c", PEAK, sys.executable, "-m", "petrobot.coordinator", *arguments],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
     )
     code, peak = map(int, process.stdout.split())
     assert code in (0, 1)
