@@ -192,10 +192,10 @@ def test_without_a_hub_there_is_one_clear_error(tmp_path: Path) -> None:
 def test_a_closed_hub_is_noticed() -> None:
     running = LiveHub(CanHub())
     bus, port = _open(running.channel), StreamPort(running.channel)
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
     limit = Limit("the frame")
-    while not port.receive() and limit.left():
-        pass
+    while not port.receive() and limit.left():  # the hub may not have registered the port yet
+        bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+        bus.recv(timeout=0.01)
     running.close()
     with pytest.raises(can.CanOperationError, match="closed by its other end"):
         bus.recv(PATIENCE)
