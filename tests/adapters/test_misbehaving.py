@@ -39,7 +39,8 @@ from petrobot.sim.bus.ur_controller import RUNNING, UrController
 from tests.adapters.opcua.test_session import Cell, await_, complete, done
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_actions import Ports as RosPorts
-from tests.waiting import Limit
+from tests.ports import free_ports
+from tests.waiting import PATIENCE_S, Limit
 
 BEGIN, END, SOON = 3.0, 8.0, 9.0
 """When the device misbehaves (s), and by when the run that it disturbs has ended."""
@@ -263,7 +264,7 @@ def test_a_ur_controller_that_misbehaves(how: str, causes: tuple[str, ...]) -> N
 
 
 @contextmanager
-def rogue(port: int, how: str) -> Iterator[int]:
+def rogue(port: int, how: str) -> Iterator[None]:
     """A server that accepts and is `silent`, sends `rubbish`, is `closed` at once, or is a
     WebSocket that stops in the middle of a frame (`half`)."""
     listener = socket.create_server(("127.0.0.1", port))
@@ -271,7 +272,7 @@ def rogue(port: int, how: str) -> Iterator[int]:
     over, held = threading.Event(), list[socket.socket]()
 
     def serve() -> None:
-        limit = Limit("the end of the test", 120.0)
+        limit = Limit("the end of the test", 2 * PATIENCE_S)
         while not over.is_set() and limit.left():
             try:
                 near, _ = listener.accept()
@@ -295,7 +296,7 @@ def rogue(port: int, how: str) -> Iterator[int]:
     thread = threading.Thread(target=serve)
     thread.start()
     try:
-        yield int(listener.getsockname()[1])
+        yield
     finally:
         over.set()
         thread.join()
@@ -324,8 +325,9 @@ def test_a_rosbridge_that_misbehaves(how: str, ended: tuple[str, str]) -> None:
             ros2.goal, device=bridge, world=pace, action="/ok", action_type="a/action/B", limit=30.0
         ).result
 
-    with rogue(0, how) as port:
-        bridge = Bridge({"url": f"ws://127.0.0.1:{port}", "heartbeat": 0.6}, RosPorts())  # type: ignore[arg-type]
+    (port,) = free_ports(1)
+    with rogue(port, how):
+        bridge = Bridge({"url": f"ws://127.0.0.1:{port}", "heartbeat": 2.0}, RosPorts())  # type: ignore[arg-type]
         try:
             found = played(bridge)
             assert (found.cause, found.executed) == ended and found.text, found
@@ -334,7 +336,7 @@ def test_a_rosbridge_that_misbehaves(how: str, ended: tuple[str, str]) -> None:
             raise
     fake = FakeProcess(port)
     try:
-        limit = Limit("a session again", 20.0)
+        limit = Limit("a session again")
         while not bridge.connected and limit.left():
             bridge.step(time.monotonic())
             time.sleep(0.01)
@@ -356,6 +358,7 @@ def test_an_opcua_server_that_misbehaves(how: str, tmp_path: Path) -> None:
             played = rehearse(opcua.write, device=driver, world=pace, values={"count": 3})
             # 2 s of it waits for a standstill that nobody can know of
             assert played.result.cause == "command_refused" and played.seconds < 3.0
+        driver.patience = PATIENCE_S
         cell.power(True)
         await_(driver, complete, "all values")
         assert done(driver, {"count": 3}) == ""

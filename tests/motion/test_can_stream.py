@@ -29,9 +29,7 @@ from petrobot.services.comm.canopen.byte_stream import (
 )
 from petrobot.services.comm.canopen.ports import PythonCanBus, StreamPort, open_can
 from tests.motion.conftest import LiveHub
-from tests.waiting import Limit
-
-PATIENCE = 5.0
+from tests.waiting import PATIENCE_S as PATIENCE, Limit
 
 
 @pytest.fixture(params=["tcp", "unix"])
@@ -60,17 +58,21 @@ def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
             receiver.recv(timeout=0.05) is None and limit.left()
         ):  # The hub had not registered the other bus yet.
             sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
-    _flush(first)
-    _flush(second)
+    _flush(first, second)
+    _flush(second, first)
     yield first, second
     first.shutdown()
     second.shutdown()
 
 
-def _flush(bus: can.BusABC) -> None:
-    limit = Limit("an empty line")
-    while bus.recv(timeout=0.02) is not None and limit.left():
-        pass
+def _flush(sender: can.BusABC, receiver: can.BusABC) -> None:
+    """Receive all that was sent before, however late the hub passes it on."""
+    sender.send(can.Message(arbitration_id=0x7FE, is_extended_id=False))
+    limit = Limit("the last message")
+    while limit.left():
+        got = receiver.recv(PATIENCE)
+        if got is not None and got.arbitration_id == 0x7FE:
+            return
 
 
 MESSAGES = [
@@ -190,10 +192,10 @@ def test_without_a_hub_there_is_one_clear_error(tmp_path: Path) -> None:
 def test_a_closed_hub_is_noticed() -> None:
     running = LiveHub(CanHub())
     bus, port = _open(running.channel), StreamPort(running.channel)
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
     limit = Limit("the frame")
-    while not port.receive() and limit.left():
-        pass
+    while not port.receive() and limit.left():  # the hub may not have registered the port yet
+        bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+        bus.recv(timeout=0.01)
     running.close()
     with pytest.raises(can.CanOperationError, match="closed by its other end"):
         bus.recv(PATIENCE)
@@ -204,11 +206,9 @@ def test_a_closed_hub_is_noticed() -> None:
 
 
 def _poll_until(hub: CanHub, condition: Any) -> None:
-    for _ in range(500):
-        if condition():
-            return
+    limit = Limit("the hub")
+    while not condition() and limit.left():
         hub.poll(0.01)
-    raise AssertionError("the hub did not get there")
 
 
 def _collect(hub: CanHub, port: CanBus, got: list[Frame]) -> None:

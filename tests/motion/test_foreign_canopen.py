@@ -26,7 +26,7 @@ from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.sim.catching.drives import ArmBus, ratings
 from tests.motion.conftest import canopen_network, live_drives
-from tests.waiting import wait_for
+from tests.waiting import PATIENCE_S, wait_for
 
 canopen: Any = importlib.import_module("canopen")  # It has hardly any annotations.
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
@@ -60,7 +60,9 @@ def _changed(pdo: Any, before: float) -> bool:
 def test_the_canopen_package_controls_our_drive(drives: ArmBus, network: Any) -> None:
     node = BaseNode402(1, EDS)
     network.add_node(node)
-    node.sdo.RESPONSE_TIMEOUT = 2.0
+    # On a busy host threads of this process may wait longer for each other than it expects.
+    node.sdo.RESPONSE_TIMEOUT = node.TIMEOUT_CHECK_TPDO = PATIENCE_S
+    node.TIMEOUT_SWITCH_STATE_FINAL = node.TIMEOUT_SWITCH_STATE_SINGLE = PATIENCE_S
     assert node.sdo[0x1000].raw == 0x00020192
     assert node.sdo[0x6502].raw == 1 << 7
     node.sdo[0x60C2][1].raw = 10
@@ -128,6 +130,8 @@ class ForeignDrive:
         network.subscribe(0x080, self._sync)
         self.node.nmt.send_command(0)
         self._target = self.position
+        self.syncs = 0
+        """How many SYNCs it has answered."""
 
     def _received(self, cob_id: int, data: bytearray, timestamp: float) -> None:
         command = command_of(data[0] | data[1] << 8)
@@ -135,6 +139,10 @@ class ForeignDrive:
         self._target = int.from_bytes(data[2:6], "little", signed=True)
 
     def _sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:
+        self._answer()
+        self.syncs += 1
+
+    def _answer(self) -> None:
         if self.node.nmt.state != "OPERATIONAL" or self.node.sdo[0x1800][1].raw & 0x80000000:
             return
         if self.state is DriveState.OPERATION_ENABLED:
@@ -158,7 +166,7 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
     targets = [0.001 * number for number in range(1, 7)]
     pause = threading.Event()
     try:
-        moved, now = 0, 0.0
+        moved, now, syncs = 0, 0.0, 0
         while moved < 50:
             now += 0.004  # Never faster than the wall clock, which the foreign nodes use.
             assert now < PATIENCE, (
@@ -177,6 +185,12 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
                 bus.send(
                     can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
                 )
+                syncs += frame.id == 0x080
+            # The foreign nodes live in a thread, which a busy host may let wait for some cycles.
+            wait_for(
+                partial(lambda sent: all(drive.syncs == sent for drive in drives), syncs),
+                awaited="the drives",
+            )
             pause.wait(0.004)
         assert not master.troubles
         for drive, target in zip(drives, targets, strict=True):

@@ -444,7 +444,7 @@ def test_the_same_seed_gives_the_same_bits_here_and_in_new_processes(
             capture_output=True,
             text=True,
             check=True,
-            timeout=120,
+            timeout=240,
             env={
                 **os.environ,
                 "PYTHONPATH": str(REPOSITORY),

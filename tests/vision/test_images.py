@@ -21,6 +21,7 @@ from petrobot.services.comm.streams.camera import (
     encode_image,
 )
 from petrobot.services.comm.streams.image import Image
+from tests.ports import free_ports
 from tests.waiting import wait_for
 
 
@@ -98,12 +99,12 @@ def test_images_arrive_at_the_requested_rate_and_stop(
 ) -> None:
     receiver.start(40.0)
     wait_for(lambda: server.rate == 40.0, server.poll, receiver.newest)
-    sent = time.monotonic() - 0.125
+    exposed = time.monotonic() - 0.125
     server.send(grey(9), 0.125)
     image = wait_for(receiver.newest, server.poll)
     assert isinstance(image, Image)
     assert np.array_equal(image.pixels, grey(9))
-    assert image.time == pytest.approx(sent, abs=0.5) and image.time <= time.monotonic() - 0.125
+    assert exposed <= image.time <= time.monotonic() - 0.125
     assert receiver.newest() is None
     receiver.stop()
     wait_for(lambda: server.rate == 0.0, server.poll)
@@ -154,8 +155,8 @@ def test_images_of_an_earlier_start_are_dropped(
 
 def test_a_camera_that_goes_away_is_found_again() -> None:
     clock = [0.0]
-    first = ImageServer("127.0.0.1", 0)
-    port = first.port
+    (port,) = free_ports(1)
+    first = ImageServer("127.0.0.1", port)
     receiver = StreamImages("127.0.0.1", port, lambda: clock[0])
     receiver.start(50.0)
     wait_for(lambda: first.rate > 0.0, first.poll, receiver.newest)

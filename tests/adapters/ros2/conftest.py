@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 FAKE = Path(__file__).parent / "fake.py"
 
 
@@ -30,12 +32,14 @@ class FakeProcess:
 
     def log(self, *operations: str) -> list[dict[str, Any]]:
         """What it has received, of these operations."""
-        with urllib.request.urlopen(self.url.replace("ws", "http", 1) + "log", timeout=10) as told:
+        with urllib.request.urlopen(
+            self.url.replace("ws", "http", 1) + "log", timeout=PATIENCE_S
+        ) as told:
             return [m for m in json.load(told) if not operations or m["op"] in operations]
 
     def post(self, verb: str, text: str = "") -> None:
         address = self.url.replace("ws", "http", 1) + verb
-        urllib.request.urlopen(address, data=text.encode(), timeout=10).close()
+        urllib.request.urlopen(address, data=text.encode(), timeout=PATIENCE_S).close()
 
     def end(self) -> None:
         self.process.kill()

@@ -15,24 +15,25 @@ import roslibpy
 
 def main(port: int, action: str, goal: str, cancel: bool) -> None:
     ros = roslibpy.Ros("127.0.0.1", port, transport="asyncio")
-    ros.run(20)
+    ros.run(60)
     client = roslibpy.ActionClient(ros, action, "petrobot_interfaces/action/RunTask")
-    over, ids = threading.Event(), list[str]()
+    begun, over = threading.Event(), threading.Event()
 
     def feedback(told: roslibpy.Feedback) -> None:
         print(json.dumps({"feedback": dict(told)}), flush=True)
-        if cancel and ids:
-            client.cancel_goal(ids.pop())
+        begun.set()
 
     def ended(kind: str, told: roslibpy.Result) -> None:
         print(json.dumps({kind: told["values"], "status": told["status"].value}), flush=True)
         over.set()
 
     goals = roslibpy.Goal(json.loads(goal))
-    ids.append(
-        client.send_goal(goals, lambda r: ended("result", r), feedback, lambda r: ended("error", r))
+    identity = client.send_goal(
+        goals, lambda r: ended("result", r), feedback, lambda r: ended("error", r)
     )
-    if not over.wait(40):
+    if cancel and begun.wait(60):
+        client.cancel_goal(identity)
+    if not over.wait(60):
         print(json.dumps({"timeout": True}), flush=True)
     ros.terminate()
 

@@ -22,7 +22,7 @@ from petrobot.services.adapters.ros2.bridge import ExchangePhase
 from tests.adapters.ros2.conftest import FakeProcess
 from tests.adapters.ros2.test_link import bridge_to
 from tests.ports import free_ports
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[3]
 RUN_TASK = Path(offering.__file__).with_name("RunTask.action").read_text(encoding="utf-8")
@@ -132,7 +132,7 @@ def played(steps: Steps, **more: Any) -> tuple[Page, Link]:
         serving = asyncio.create_task(offer.serve(stop))
         await steps(page, link)
         stop.set()
-        await asyncio.wait_for(serving, 20)
+        await asyncio.wait_for(serving, PATIENCE_S)
 
     asyncio.run(play())
     assert link.sent[0]["op"] == "advertise_action"
@@ -448,7 +448,7 @@ def offered(
     yield process
     for started in (offer, serving):
         started.terminate()
-        assert started.wait(30) == 0
+        assert started.wait(PATIENCE_S) == 0
         assert started.stdout is not None
         started.stdout.close()
 
@@ -463,12 +463,12 @@ def test_petrobot_starts_petrobot(offered: FakeProcess) -> None:
     bridge.until_phase(ExchangePhase.SUCCEEDED, "first")
     one = bridge.exchanges.open["first"]
     assert one.values["state"] == "success" and json.loads(one.values["result"])["task"] == "rest"
-    assert one.feedback["places"]
     request = {"op": "send_action_goal", "action": "/rest", "action_type": offering.TYPE}
     bridge.command(
         time.monotonic(), {"goal": {**request, "args": {"seconds": 50.0}}, "run": "second"}
     )
     bridge.until_phase(ExchangePhase.ACTIVE, "second")
+    assert bridge.exchanges.open["second"].feedback["places"]
     bridge.command(time.monotonic(), {"cancel": "second"})
     bridge.until_phase(ExchangePhase.CANCELLED, "second")
     bridge.command(time.monotonic(), {"goal": {**request, "args": {"hours": 50.0}}, "run": "third"})
@@ -485,7 +485,8 @@ def test_a_foreign_client_starts_petrobot(
     offered: FakeProcess, goal: dict[str, float], cancel: list[str], status: int
 ) -> None:
     told = foreign(offered, "/rest", json.dumps(goal), *cancel)
-    assert told[-1]["status"] == status and "feedback" in told[0]
+    assert told[-1]["status"] == status
+    assert "feedback" in told[0] or not cancel  # on a busy host a short run may end before any
     assert set(told[-1]["result"]) == {"state", "reason", "result"}
 
 
@@ -510,7 +511,7 @@ def foreign(fake: FakeProcess, *arguments: str) -> list[dict[str, Any]]:
         [sys.executable, str(script), str(fake.port), *arguments],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=4 * PATIENCE_S,
     )
     assert ran.returncode == 0, ran.stderr
     return [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]

@@ -22,7 +22,7 @@ def test_the_task_runs_in_lock_step(tmp_path: Path) -> None:
         cwd=cell,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads((cell / "out.json").read_text(encoding="utf-8"))

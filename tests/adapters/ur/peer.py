@@ -12,15 +12,17 @@ HOST = sys.argv[1]
 FIELDS = ["timestamp", "actual_q", "robot_mode", "safety_mode", "runtime_state"]
 dashboard = dashboard_client.DashboardClient(HOST)
 dashboard.connect()
+END = time.monotonic() + 60.0  # less than the test waits
 dashboard.powerOn()
-time.sleep(0.8)
+while "IDLE" not in dashboard.robotmode() and time.monotonic() < END:
+    time.sleep(0.05)
 dashboard.brakeRelease()
 receive = rtde_receive.RTDEReceiveInterface(HOST, -1.0, FIELDS)
-end = time.monotonic() + 20.0
-while receive.getRobotMode() != 7 and time.monotonic() < end:
+while receive.getRobotMode() != 7 and time.monotonic() < END:
     time.sleep(0.05)
 first = receive.getTimestamp()
-time.sleep(0.5)
+while receive.getTimestamp() - first <= 0.1 and time.monotonic() < END:
+    time.sleep(0.05)
 seen = {
     "q": receive.getActualQ(),
     "mode": receive.getRobotMode(),

@@ -35,7 +35,7 @@ def test_ur_rtde_reads_the_arm_and_speaks_to_the_dashboard() -> None:
                 [sys.executable, str(HERE / "peer.py"), HOST],
                 capture_output=True,
                 text=True,
-                timeout=60,
+                timeout=120,
             )
             assert done.returncode == 0, done.stderr
         finally:

@@ -342,7 +342,7 @@ def test_a_seed_gives_one_run_in_another_process(rover_bench: Bench) -> None:
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=240,
     ).stdout
     lab = TrackLaboratory("l", read_track_site(Path(rover)), str, seed=3, regime="arcs+flash")
     assert (

@@ -91,7 +91,7 @@ async def _conducted(
     until = loop.time() + PATIENCE
     # the scheduler creates the file before it writes it
     while not (where.exists() and where.read_text().endswith("}")) and loop.time() < until:
-        await beat(0)
+        await beat()
     address = json.loads(where.read_text(encoding="utf-8"))["address"]
 
     def watch(progress: CampaignProgress) -> None:
