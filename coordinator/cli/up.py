@@ -173,14 +173,17 @@ def only_here(host: str) -> str:
     host's own name in Debian's /etc/hosts, or 0.0.0.0; else empty."""
     if is_loopback(host):
         return ""
-    *_, found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
-    address = ipaddress.ip_address(str(found[0]).partition("%")[0])
-    if not (address.is_loopback or address.is_unspecified):
+    try:
+        known = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except OSError:  # the name server has just gone away: the nodes listen all the same
         return ""
-    own = f"{host} stands for {address} here"
-    why = own if address.is_loopback else f"{host} is not the address of one host"
+    found = [ipaddress.ip_address(str(at[0]).partition("%")[0]) for *_, at in known]
+    if not all(address.is_loopback or address.is_unspecified for address in found):
+        return ""
+    own = f"{host} stands for {found[0]} here"
+    why = own if found[0].is_loopback else f"{host} is not the address of one host"
     text = f"other hosts cannot reach it: {why}; write the address of this host into services.toml"
-    return f"{text}, or correct /etc/hosts" if address.is_loopback else text
+    return f"{text}, or correct /etc/hosts" if found[0].is_loopback else text
 
 
 # --- one node, or the laboratory ---

@@ -9,6 +9,7 @@ import resource
 import signal
 import time
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,12 @@ def gate(tmp_path: Path) -> Path:
     file = tmp_path / "gate"
     file.touch()
     return file
+
+
+def napping(operator: Operator, count: int, gate: Path) -> list[asyncio.Task[Outcome]]:
+    """Begin runs that end when the gate is removed."""
+    call = partial(operator.call, "nap", PATIENCE, seconds=PATIENCE, gate=str(gate))
+    return [asyncio.create_task(call()) for _ in range(count)]
 
 
 async def gone(operator: Operator, process: int) -> None:
@@ -325,10 +332,7 @@ async def test_a_run_that_reports_without_end_disturbs_no_other(
 async def test_a_run_beyond_the_limit_is_refused_with_the_reason(
     operator: Operator, gate: Path
 ) -> None:
-    naps = [
-        asyncio.create_task(operator.call("nap", PATIENCE, seconds=PATIENCE, gate=str(gate)))
-        for _ in range(6)
-    ]
+    naps = napping(operator, 6, gate)
 
     async def full() -> bool:
         status = await operator.command("left", "status")
@@ -372,10 +376,7 @@ async def test_too_much_memory_ends_only_its_run(own_nodes: Nodes) -> None:
 async def test_hold_and_stop_reach_all_runs_without_a_device(
     operator: Operator, gate: Path
 ) -> None:
-    naps = [
-        asyncio.create_task(operator.call("nap", PATIENCE, seconds=PATIENCE, gate=str(gate)))
-        for _ in range(2)
-    ]
+    naps = napping(operator, 2, gate)
     await until(lambda: sum(isinstance(one, Feedback) for one in operator.notices) == 2)
     assert (await operator.command("left", "hold")).data["answers"]["left"] == "held"
     gate.unlink()

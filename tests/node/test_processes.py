@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -340,7 +341,7 @@ async def test_a_cyclic_device_moves_and_is_paced(operator: Operator) -> None:
     limit, paced = Limit("a driver that is not stepped more often than its period says"), False
     while not paced and limit.left():  # a node that was late may have told an older count at first
         began, first = time.monotonic(), await cycles(operator)
-        await operator.until(lambda least=first + 25: _stepped(operator, least))  # type: ignore[misc]
+        await operator.until(partial(_stepped, operator, first + 25))
         last, took = await cycles(operator), time.monotonic() - began
         paced = last - first <= took / 0.02 + 2
     refused = await operator.call("go", to=1e6)
